@@ -1,0 +1,3 @@
+"""Data-driven precomputed radiance transfer."""
+
+__version__ = "0.1.0"

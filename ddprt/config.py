@@ -1,0 +1,278 @@
+"""Every setting of a run: one frozen model per section, in the order of the walk.
+
+TOML goes in, the resolved configuration comes out and is accepted as input again. `--section.key value` on the command
+line overrides the file. This module imports no room, so that `ddprt --help` stays instant.
+"""
+
+import hashlib
+import json
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from ddprt.errors import UserError, nearest
+
+Range = tuple[float, float]
+Unit = Annotated[float, Field(ge=0.0, le=1.0)]
+
+
+class Section(BaseModel):
+    """A section of the file: unknown keys are errors, values never change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class SceneConfig(Section):
+    """What stays still."""
+
+    name: str = Field("cornell", description="a name of SCENES, or a path to an .obj, .ply or .glb file")
+    parameters: dict[str, float] = Field({}, description="numbers that a scene in code takes, e.g. {albedo = 0.5}")
+
+
+class AtlasConfig(Section):
+    """The lightmap that the scene is unwrapped onto."""
+
+    resolution: int = Field(256, ge=8, le=8192, description="texels per side, met exactly")
+    padding: int = Field(2, ge=1, le=64, description="empty texels between charts")
+
+
+class LightingsConfig(Section):
+    """The lightings that are baked: drawn from a distribution, or read from a file."""
+
+    train: int = Field(128, ge=1, description="lightings to learn from")
+    validation: int = Field(16, ge=1, description="lightings that learned methods stop early on")
+    test: int = Field(32, ge=1, description="held-out lightings that every score is computed on")
+    file: str = Field("", description="JSON list of lightings to use instead of drawing; split in the order train, validation, test")
+    distribution: Literal["room", "around"] = Field(
+        "room", description="room: free space inside the bounding box; around: a shell about the asset"
+    )
+    kinds: tuple[Literal["point", "spot", "directional", "rect", "sphere"], ...] = Field(
+        ("point",), min_length=1, description="kinds of light to draw from, each equally likely"
+    )
+    lights: tuple[int, int] = Field((1, 1), description="fewest and most lights that are on together")
+    region_low: tuple[Unit, Unit, Unit] = Field(
+        (0.0, 0.0, 0.0), description="room: lowest lamp position as fractions of the bounding box (x, y, z)"
+    )
+    region_high: tuple[Unit, Unit, Unit] = Field((1.0, 1.0, 1.0), description="room: highest lamp position, likewise")
+    clearance: float = Field(0.05, ge=0.0, description="room: metres to keep from every surface")
+    distance: Range = Field((1.5, 3.0), description="around: distance from the asset's centre in bounding radii")
+    elevation_deg: Range = Field((0.0, 90.0), description="around: height above the horizon")
+    intensity: Range = Field((1.0, 1.0), description="W/sr of a lamp at each end of a log-uniform range")
+    saturation: Range = Field((0.0, 0.0), description="0 is white, 1 a fully saturated random hue")
+    spot_outer_deg: Range = Field((25.0, 50.0), description="half-angle of a spot's cone; the inner cone is 0.6 of it")
+    size: float = Field(0.05, gt=0.0, description="area lights: half-edge or radius, as a fraction of the bounding radius")
+
+    @model_validator(mode="after")
+    def _ranges_rise(self) -> Self:
+        for name in ("lights", "distance", "elevation_deg", "intensity", "saturation", "spot_outer_deg"):
+            low, high = getattr(self, name)
+            if low > high:
+                raise ValueError(f"{name}: got [{low}, {high}], expected the lower end first")
+        if self.lights[0] < 1:
+            raise ValueError(f"lights: got {self.lights[0]}, expected at least 1")
+        if self.intensity[0] <= 0:
+            raise ValueError(f"intensity: got {self.intensity[0]}, expected more than 0")
+        if not 0 <= self.saturation[0] <= self.saturation[1] <= 1:
+            raise ValueError("saturation: expected both ends between 0 and 1")
+        if not 0 < self.spot_outer_deg[0] <= self.spot_outer_deg[1] < 90:
+            raise ValueError("spot_outer_deg: expected half-angles between 0 and 90")
+        for axis, low, high in zip("xyz", self.region_low, self.region_high, strict=True):
+            if low >= high:
+                raise ValueError(f"region: {axis} runs from {low} to {high}, expected a rising range")
+        return self
+
+
+class PointsConfig(Section):
+    """Where direct light is measured."""
+
+    count: int = Field(128, ge=1, description="measurement points")
+    supersample: int = Field(8, ge=1, le=64, description="samples averaged into each point")
+    on: Literal["surface", "hull"] = Field("surface", description="the scene's surface, or its convex hull")
+    file: str = Field("", description="JSON list of {position, normal, albedo} to use instead of distributing points")
+    quantity: Literal["radiosity", "irradiance"] = Field("radiosity", description="what is measured there, W/m²")
+
+
+class TransportConfig(Section):
+    """How light is simulated."""
+
+    integrator: Literal["auto", "operator", "reference"] = Field(
+        "auto", description="auto takes the cheapest that is valid; reference is unbiased path tracing per lighting"
+    )
+    samples: int = Field(512, ge=1, le=65536, description="gather rays per texel for train and validation")
+    test_samples: int = Field(1024, ge=2, le=131072, description="gather rays per texel for held-out lightings, in two halves")
+    direct_samples: int = Field(4, ge=1, le=1024, description="shadow rays per texel and light")
+    sender_resolution: int = Field(
+        0, ge=0, le=1024, description="texels per side of the coarser atlas that light bounces off; 0 chooses min(resolution, 128)"
+    )
+    bounces: int = Field(-1, ge=-1, description="-1: as many as the scene calls for; 0, 1, 2...: forced, and reported")
+    threads: int = Field(0, ge=0, description="0: one per core")
+
+
+class FitConfig(Section):
+    """From pairs to a runtime."""
+
+    method: str = Field("svd-ridge", description="entry of METHODS that is saved and exported")
+    bases: int = Field(16, ge=1, description="basis vectors, the mean counted in where there is one")
+    space: Literal["linear", "gamma"] = Field("linear", description="where transfer happens")
+    gamma: float = Field(2.2, ge=1.0, le=10.0, description="exponent of the gamma space")
+    centre: Literal["none", "mean"] = Field("none", description="none keeps relighting exactly linear; mean is the paper's")
+    channels: Literal["mono", "multi"] = Field("mono", description="one basis and a matrix per channel, or interleaved colours")
+    weights: Literal["area", "texel"] = Field("area", description="what the basis is best for: the surface, or the atlas")
+    ridge: Literal["auto"] | Annotated[float, Field(ge=0.0)] | tuple[Annotated[float, Field(ge=0.0)], ...] = Field(
+        "auto", description="auto (leave-one-out), a number, or one number per measurement point; 0 is the pseudo-inverse"
+    )
+
+
+class MethodsConfig(Section):
+    """Who is compared on the same split."""
+
+    compare: tuple[str, ...] = Field(("svd-ridge", "mean", "nearest", "mlp"), description="entries of METHODS in the table")
+    settings: dict[str, dict[str, Any]] = Field({}, description="a method's own settings, e.g. [methods.settings.mlp]")
+
+
+class ReportConfig(Section):
+    """What the report shows."""
+
+    rows: int = Field(4, ge=1, le=64, description="held-out lightings shown as pictures")
+    bases_curve: tuple[int, ...] = Field((4, 8, 16, 32, 64), description="numbers of bases on the error curve")
+    spot_check_texels: int = Field(256, ge=0, description="texels checked against the reference integrator; 0 skips")
+    spot_check_lightings: int = Field(4, ge=1, description="held-out lightings checked there")
+    spot_check_samples: int = Field(512, ge=2, description="paths per texel of that check")
+
+
+class ExportConfig(Section):
+    """What engines load."""
+
+    precision: Literal["half", "float"] = Field("half", description="of the basis textures")
+    gutter: int = Field(4, ge=0, le=64, description="texels that charts are extended by, smoothly")
+
+
+class Config(Section):
+    """A whole run."""
+
+    seed: int = Field(0, ge=0, le=2**32 - 1, description="every random number follows from it")
+    scene: SceneConfig = SceneConfig()
+    atlas: AtlasConfig = AtlasConfig()
+    lightings: LightingsConfig = LightingsConfig()
+    points: PointsConfig = PointsConfig()
+    transport: TransportConfig = TransportConfig()
+    fit: FitConfig = FitConfig()
+    methods: MethodsConfig = MethodsConfig()
+    report: ReportConfig = ReportConfig()
+    export: ExportConfig = ExportConfig()
+
+    def to_toml(self) -> str:
+        """The resolved configuration as TOML, accepted as input again."""
+        document = self.model_dump(mode="json")
+        lines = [f"seed = {document.pop('seed')}"]
+        for section, values in document.items():
+            lines += ["", f"[{section}]", *(f"{key} = {_toml(value)}" for key, value in values.items())]
+        return "\n".join(lines) + "\n"
+
+    def digest(self, *sections: str) -> str:
+        """Hash of the named sections (all, if none are named) and the seed: equal digests mean equal results."""
+        chosen = self.model_dump(mode="json", include={*sections, "seed"} if sections else None)
+        return hashlib.sha256(json.dumps(chosen, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def load_config(path: str | Path | None, overrides: dict[str, str] | None = None) -> Config:
+    """Reads a TOML file (or the defaults) and applies overrides.
+
+    Args:
+      path: the file, or None for the defaults.
+      overrides: dotted key to the text given on the command line, e.g. `{"fit.bases": "32"}`.
+    Returns:
+      The validated configuration. Relative paths in it are taken from the working directory.
+    Raises:
+      UserError: one line with file, key, got and expected for the first fault.
+    """
+    document: dict[str, Any] = {}
+    if path is not None:
+        try:
+            document = tomllib.loads(Path(path).read_text("utf-8"))
+        except OSError as error:
+            raise UserError(f"{path}: got {error.strerror or error}, expected a readable TOML file") from None
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise UserError(f"{path}: not TOML: {error}") from None
+    for dotted, text in (overrides or {}).items():
+        _check_key(dotted)
+        *parents, leaf = dotted.split(".")
+        table = document
+        for parent in parents:
+            table = table.setdefault(parent, {})
+            if not isinstance(table, dict):
+                raise UserError(f"--{dotted}: got a table, but {path} gives {parent} a plain value; mend the file")
+        table[leaf] = _literal(text)
+    try:
+        return Config.model_validate(document)
+    except ValidationError as error:
+        raise UserError(explain(error, path, overrides or {})) from None
+
+
+def keys(model: type[BaseModel] = Config, prefix: str = "") -> list[str]:
+    """Every dotted key, e.g. "fit.bases"."""
+    found = []
+    for name, field in model.model_fields.items():
+        annotation = field.annotation
+        if isinstance(annotation, type) and issubclass(annotation, Section):
+            found += keys(annotation, f"{prefix}{name}.")
+        else:
+            found.append(prefix + name)
+    return found
+
+
+def explain(error: ValidationError, path: str | Path | None, overrides: dict[str, str]) -> str:
+    """First fault of a pydantic error as one line: file, key, got, expected, nearest spelling."""
+    faults = error.errors()
+    fault = faults[0]
+    place = [str(part) for part in fault["loc"]]
+    dotted = next((key for n in range(len(place), 0, -1) if (key := ".".join(place[:n])) in keys()), ".".join(place))
+    source = f"--{dotted}" if dotted in overrides else f"{path or 'configuration'}: {dotted}"
+    if fault["type"] == "extra_forbidden":
+        siblings = [key for key in keys() if key.split(".")[:-1] == place[:-1]] or keys()
+        sections = [*siblings, *(key.split(".")[0] for key in keys())] if len(place) == 1 else siblings
+        names = sorted({key.rsplit(".", 1)[-1] for key in sections})
+        return f"{source}: unknown key{nearest(place[-1], names)}; known here: {', '.join(names)}"
+    if fault["type"] == "value_error":
+        return f"{source}: {str(fault['ctx']['error'])}" if place else f"{path}: {fault['ctx']['error']}"
+    related = [other for other in faults if ".".join(map(str, other["loc"])).startswith(dotted)]
+    expected = " or ".join(dict.fromkeys(_expected(other) for other in related))
+    return f"{source}: got {fault['input']!r}, expected {expected}{_choice_hint(fault)}"
+
+
+def _expected(fault: Any) -> str:
+    text = fault["msg"].removeprefix("Input should be ").removeprefix("a valid ")
+    return text.removeprefix("Input should have ").split(", unable")[0]
+
+
+def _choice_hint(fault: Any) -> str:
+    if fault["type"] != "literal_error" or not isinstance(fault["input"], str):
+        return ""
+    return nearest(fault["input"], fault["ctx"]["expected"].replace("'", "").replace(" or ", ", ").split(", "))
+
+
+def _check_key(dotted: str) -> None:
+    known = keys()
+    free = ("scene.parameters.", "methods.settings.")
+    if dotted not in known and not dotted.startswith(free):
+        raise UserError(f"--{dotted}: unknown key{nearest(dotted, known)}; `ddprt run --help` lists all")
+
+
+def _literal(text: str) -> Any:
+    """A TOML value if the text is one, else the text itself: `0.1`, `[1, 2]` and `auto` all work."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{json.dumps(key)} = {_toml(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    return json.dumps(value)

@@ -1,0 +1,39 @@
+"""Lights too far away to have a place: directional."""
+
+from typing import ClassVar, Literal, Self
+
+import numpy as np
+
+from ddprt.axes import Float
+from ddprt.lights.light import Colour, Direction, Illumination, LightModel, brightened, unit
+
+
+class DirectionalLight(LightModel):
+    """Parallel light; `direction` is where it travels, `irradiance` in W/m² on a plane that faces it."""
+
+    kind: ClassVar[str] = "directional"
+    delta: ClassVar[bool] = True
+    type: Literal["directional"] = "directional"
+    direction: Direction
+    irradiance: Colour
+
+    def illuminate(self, points: Float[np.ndarray, "n 3"], u: Float[np.ndarray, "n 2"]) -> Illumination:
+        """See `Light`."""
+        towards = -unit(np.asarray(self.direction, points.dtype))
+        return Illumination(
+            np.broadcast_to(towards, points.shape),
+            np.full(len(points), np.inf, points.dtype),
+            np.broadcast_to(np.asarray(self.irradiance, points.dtype), points.shape),
+        )
+
+    def translated(self, offset: Float[np.ndarray, "3"]) -> Self:
+        """See `Light`; it has no place to move."""
+        return self
+
+    def anchor(self) -> Float[np.ndarray, "3"] | None:
+        """See `Light`."""
+        return None
+
+    def scaled(self, factor: float) -> Self:
+        """See `Light`."""
+        return self.model_copy(update={"irradiance": brightened(self.irradiance, factor)})

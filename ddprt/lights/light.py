@@ -1,0 +1,93 @@
+"""The whole duty of a light, on one screen.
+
+Lights are frozen pydantic models: their JSON is validated with the same one-line errors as the configuration. All arrays
+are float32 or float64 NumPy, world space, metres.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Protocol, Self, runtime_checkable
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from ddprt.axes import Float
+
+Vector = tuple[float, float, float]
+Colour = tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]]
+
+
+def _not_zero(vector: Vector) -> Vector:
+    if not any(vector):
+        raise ValueError("got a vector of length 0, expected a direction")
+    return vector
+
+
+Direction = Annotated[Vector, AfterValidator(_not_zero)]
+
+
+class LightModel(BaseModel):
+    """Base of the light records: unknown keys are errors, numbers are finite, values never change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+@dataclass(frozen=True)
+class Illumination:
+    """One sample of a light for each shaded point.
+
+    Attributes:
+      direction: unit vectors from the point towards the light.
+      distance: metres that a shadow ray must cross; infinity for distant lights.
+      irradiance: W/m² on a plane that faces `direction`, already divided by the sampling density.
+    """
+
+    direction: Float[np.ndarray, "n 3"]
+    distance: Float[np.ndarray, " n"]
+    irradiance: Float[np.ndarray, "n 3"]
+
+
+@runtime_checkable
+class Light(Protocol):
+    """What transport asks of a light. A new kind is one class and one entry of `LIGHTS`.
+
+    Attributes:
+      kind: its name in JSON, in plans and in messages.
+      delta: one ray reaches all of it, so more samples per point would be wasted.
+    """
+
+    kind: ClassVar[str]
+    delta: ClassVar[bool]
+
+    def illuminate(self, points: Float[np.ndarray, "n 3"], u: Float[np.ndarray, "n 2"]) -> Illumination:
+        """Samples the light from each point: the mean over uniform `u` of irradiance * cosine * visible is E."""
+        ...
+
+    def translated(self, offset: Float[np.ndarray, "3"]) -> Self:
+        """The same light moved by `offset` metres: transport works relative to the scene's centre."""
+        ...
+
+    def anchor(self) -> Float[np.ndarray, "3"] | None:
+        """Where the light stands, to tell whether that is inside a solid; None for distant lights."""
+        ...
+
+    def scaled(self, factor: float) -> Self:
+        """The same light, `factor` times as strong."""
+        ...
+
+
+def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """Normalises; zero vectors stay zero."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.maximum(length, np.finfo(vectors.dtype).tiny)
+
+
+def brightened(colour: Colour, factor: float) -> Colour:
+    """A colour times a factor."""
+    red, green, blue = colour
+    return (red * factor, green * factor, blue * factor)
+
+
+def moved(position: Vector, offset: Float[np.ndarray, "3"]) -> Vector:
+    """A position plus an offset."""
+    x, y, z = (np.asarray(position) + offset).tolist()
+    return (x, y, z)

@@ -1,0 +1,71 @@
+"""The only door to OpenEXR: contiguous arrays in, half floats that never overflow, files that are whole or absent."""
+
+from pathlib import Path
+
+import numpy as np
+
+from ddprt.axes import Float
+from ddprt.errors import UserError
+from ddprt.files import written_whole
+
+HALF_MAX = 65504.0
+
+
+def write_exr(
+    path: Path, image: Float[np.ndarray, "height width channels"], *, half: bool = False, attributes: dict[str, str] | None = None
+) -> None:
+    """Writes a ZIP-compressed scanline EXR, row 0 at the top.
+
+    Args:
+      path: where; written under another name first, so that a reader never sees half a file.
+      image: 1 (Y), 3 (RGB) or 4 (RGBA) channels.
+      half: store 16-bit floats; values past 65504 are an error, since they would turn into infinity.
+      attributes: strings for the header.
+    Raises:
+      UserError: the disk or the folder refuses.
+      ValueError: not finite, or too large for half floats.
+    """
+    import OpenEXR
+
+    channels = image.shape[2]
+    stored = np.ascontiguousarray(image, dtype=np.float16 if half else np.float32) if _fits(image, half) else None
+    if stored is None:
+        raise ValueError(f"{path.name}: values up to {np.abs(image).max():g} do not fit, expected finite and within the format")
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(attributes or {})}
+    name = {1: "Y", 3: "RGB", 4: "RGBA"}[channels]
+    with written_whole(path) as temporary:
+        OpenEXR.File(header, {name: stored[..., 0].copy() if channels == 1 else stored}).write(str(temporary))
+
+
+def read_exr(path: Path) -> tuple[Float[np.ndarray, "height width channels"], dict[str, str]]:
+    """Reads an EXR as float32 with row 0 at the top, and its string attributes.
+
+    Raises:
+      UserError: missing, truncated or not an EXR.
+    """
+    import OpenEXR
+
+    if not path.is_file():
+        raise UserError(f"{path}: got no file, expected an EXR image; bake again or mend the path")
+    try:
+        with OpenEXR.File(str(path)) as file:
+            channels = file.channels()
+            header = {key: value for key, value in file.header().items() if isinstance(value, str)}
+            for name in ("RGBA", "RGB", "Y"):
+                if name in channels:
+                    pixels = np.array(channels[name].pixels, np.float32)
+                    return pixels if pixels.ndim == 3 else pixels[..., None], header
+    except UserError:
+        raise
+    except Exception as error:
+        raise UserError(f"{path}: not a whole EXR image ({str(error).splitlines()[0]}); bake or copy it again") from None
+    raise UserError(f"{path}: got channels {', '.join(channels)}, expected RGB, RGBA or Y")
+
+
+def exposure_for(peak: float) -> int:
+    """Power of two that brings `peak` safely into half range: stored = value * 2**-exposure."""
+    return 0 if not 0 < peak < np.inf else int(np.ceil(np.log2(peak)))
+
+
+def _fits(image: np.ndarray, half: bool) -> bool:
+    return bool(np.isfinite(image).all() and (not half or np.abs(image).max(initial=0) <= HALF_MAX))

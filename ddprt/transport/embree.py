@@ -1,0 +1,148 @@
+"""The only door to Embree: closest hits and shadow rays, threaded over slices.
+
+Rays live in the scene's own frame (relative to its centre), so that float32 keeps its precision far from the origin.
+Every origin is moved off its surface by one named distance, and shadow rays stop short of the light by the same.
+"""
+
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import islice
+from threading import Lock
+from typing import Any, TypeVar
+
+import numpy as np
+
+from ddprt import warp
+from ddprt.axes import Bool, Float, Float32, Float64, Int32
+from ddprt.errors import UserError
+from ddprt.scene.mesh import Scene
+
+SELF_OFFSET = 2e-6
+"""Distance between a ray's origin and its surface, as a share of the bounding box's diagonal: about 30 times the rounding
+of float32 coordinates there, and 1.6 micrometres for the Cornell box."""
+
+_PROBES = 64  # directions that tell free space from a solid's inside
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class Hits:
+    """Closest hits of rays.
+
+    Attributes:
+      triangle: index, -1 where the ray escaped.
+      u, v: weights of the second and third corner.
+      front: the triangle was met from its front.
+      distance: metres; undefined where the ray escaped.
+    """
+
+    triangle: Int32[np.ndarray, " rays"]
+    u: Float32[np.ndarray, " rays"]
+    v: Float32[np.ndarray, " rays"]
+    front: Bool[np.ndarray, " rays"]
+    distance: Float32[np.ndarray, " rays"]
+
+
+class Tracer:
+    """A scene that rays can be shot at.
+
+    Args:
+      corners: triangle corners, world space, metres.
+      threads: workers of `map`; 0 takes one per core.
+    Raises:
+      UserError: embreex is missing (there is no slow fallback).
+    """
+
+    def __init__(self, corners: Float64[np.ndarray, "triangles 3 3"], threads: int = 0) -> None:
+        try:
+            from embreex.mesh_construction import TriangleMesh
+            from embreex.rtcore_scene import EmbreeScene
+        except ImportError as error:
+            raise UserError(f"embreex: got {error}, expected the ray tracer; pip install embreex") from None
+        low, high = corners.min((0, 1)), corners.max((0, 1))
+        self.centre = (low + high) / 2
+        self.radius = float(np.linalg.norm(high - low) / 2)
+        self.offset = np.float32(2 * SELF_OFFSET * self.radius)
+        self.threads = threads or (os.cpu_count() or 1)
+        self.rays = 0
+        self._counting = Lock()
+        local = (corners - self.centre).astype(np.float32)
+        self.corners = local
+        cross = np.cross(local[:, 1] - local[:, 0], local[:, 2] - local[:, 0]).astype(np.float64)
+        self.normals = (cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-300)).astype(np.float32)
+        self.frames = warp.frame(self.normals)
+        self._embree = EmbreeScene()
+        self._mesh = TriangleMesh(
+            self._embree, local.reshape(-1, 3), np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)
+        )
+        # The first run commits the scene; it must not happen in two threads at once.
+        self._embree.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+
+    @classmethod
+    def of(cls, scene: Scene, threads: int = 0) -> "Tracer":
+        """The tracer of a scene."""
+        return cls(scene.corners, threads)
+
+    def closest(self, origins: Float32[np.ndarray, "rays 3"], directions: Float32[np.ndarray, "rays 3"]) -> Hits:
+        """First surface along each ray (centred frame, unit directions)."""
+        self._count(len(origins))
+        found = self._embree.run(
+            np.ascontiguousarray(origins), np.ascontiguousarray(directions), query="INTERSECT", output=True
+        )
+        triangle = found["primID"]
+        front = np.einsum("nd,nd->n", self.normals[triangle], directions) < 0
+        return Hits(triangle, found["u"], found["v"], front & (triangle >= 0), found["tfar"])
+
+    def unoccluded(
+        self,
+        origins: Float32[np.ndarray, "rays 3"],
+        directions: Float32[np.ndarray, "rays 3"],
+        distances: Float32[np.ndarray, " rays"],
+    ) -> Bool[np.ndarray, " rays"]:
+        """Whether nothing lies between each origin and its light, `distances` metres away."""
+        self._count(len(origins))
+        reach = np.maximum(distances - self.offset, 0).astype(np.float32)
+        seen = self._embree.run(
+            np.ascontiguousarray(origins), np.ascontiguousarray(directions), dists=reach, query="OCCLUDED"
+        )
+        return np.asarray(seen) != 0
+
+    def _count(self, rays: int) -> None:
+        with self._counting:
+            self.rays += rays
+
+    def clearance(self, positions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
+        """Free radius about positions in world space, metres; 0 inside a solid or behind a room's walls.
+
+        A position counts as free when less than half of the surfaces it sees show their backs. The radius is that of the
+        nearest of 64 spread hits: an upper estimate of the true distance, cheap and good enough to place lamps.
+        """
+        directions = warp.sample_sphere(warp.sobol(_PROBES, 2, seed=1))
+        origins = np.repeat((positions - self.centre).astype(np.float32), _PROBES, 0)
+        hits = self.closest(origins, np.tile(directions, (len(positions), 1)))
+        hit = (hits.triangle >= 0).reshape(-1, _PROBES)
+        back = hit & ~hits.front.reshape(-1, _PROBES)
+        nearest = np.where(hit, hits.distance.reshape(-1, _PROBES), np.inf).min(1)
+        return np.where(2 * back.sum(1) > hit.sum(1), 0.0, nearest)
+
+    def map(self, work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+        """Results of `work` in the order of `items`, at most twice the threads ahead; NumPy and Embree free the GIL."""
+        pool = ThreadPoolExecutor(self.threads)
+        waiting: list[Future[Result]] = []
+        source = iter(items)
+        try:
+            waiting += [pool.submit(work, item) for item in islice(source, 2 * self.threads)]
+            while waiting:
+                yield waiting.pop(0).result()
+                waiting += [pool.submit(work, item) for item in islice(source, 1)]
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def lifted(tracer: Tracer, positions: Any, normals: Any) -> Float32[np.ndarray, "n 3"]:
+    """Ray origins: centred positions moved off their surface along its normal."""
+    return positions + tracer.offset * normals

@@ -1,0 +1,175 @@
+"""Every lighting at once: paths do not know which light is on.
+
+The gather operator G says which share of a receiver's cosine-weighted hemisphere sees which sender. It is traced once,
+and every lighting of the batch is then one column of a matrix product:
+
+    senders:    x = E0 + G R x                 solved as a Neumann series (R = diagonal albedo)
+    receivers:  E_indirect = G R x
+
+Senders are the receivers' own texels in blocks (`Atlas.senders`), so their direct light is an area-weighted mean that
+costs no ray. The price is light averaged inside a block: a bias that the report's spot check measures against `reference`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ddprt import seeds, warp
+from ddprt.axes import Float32, Int, Int32
+from ddprt.scene.atlas import Atlas, Senders, SurfaceSampler
+from ddprt.transport.embree import Tracer, lifted
+
+_TILE_RAYS = 1 << 16  # rays gathered together by one thread
+_TOLERANCE = 1e-4  # of a lighting's largest indirect value: where the series stops
+_MAX_BOUNCES = 512  # a closed white room never ends; what is left is reported
+
+
+@dataclass(frozen=True)
+class OperatorResult:
+    """Indirect light of all lightings.
+
+    Attributes:
+      indirect: irradiance, W/m².
+      bounces: terms of the series that were summed.
+      remainder: bound on the light of all further bounces, as a share of the lighting's largest indirect value.
+      senders: number of senders.
+    """
+
+    indirect: Float32[np.ndarray, "lightings texels 3"]
+    bounces: int
+    remainder: float
+    senders: int
+
+
+def operator_indirect(
+    tracer: Tracer,
+    atlas: Atlas,
+    direct: Float32[np.ndarray, "lightings texels 3"],
+    *,
+    samples: int,
+    sender_resolution: int,
+    seed: int,
+    stream: str,
+    bounces: int = -1,
+    advance: Callable[[int], None] = lambda texels: None,
+) -> OperatorResult:
+    """Indirect irradiance at every covered texel for every lighting.
+
+    Args:
+      tracer, atlas: the scene.
+      direct: direct irradiance on the atlas, W/m².
+      samples: gather rays per texel and per sender.
+      sender_resolution: senders along a side of the atlas.
+      seed, stream: address of the random numbers; another stream gives independent noise.
+      bounces: -1 sums the series until what is left is negligible; otherwise exactly this many, at least 1.
+      advance: told the number of texels after each finished tile.
+    """
+    senders = atlas.senders(sender_resolution)
+    rng = seeds.stream(seed, "gather", *stream.encode())
+    pattern = warp.sobol(samples, 4, seeds.number(seed, "gather pattern", *stream.encode()))
+    light, summed, remainder = _solve(tracer, atlas, senders, direct, pattern, rng, bounces)
+
+    indirect = np.empty((direct.shape[1], light.shape[1]), np.float32)
+    shifts = rng.random((atlas.count, 4), np.float32)
+    for texels, rows in _rows(tracer, atlas, senders, atlas.sampler, pattern, shifts):
+        indirect[texels] = rows @ light
+        advance(len(rows))
+    shape = (atlas.count, len(direct), 3)
+    return OperatorResult(np.ascontiguousarray(indirect.reshape(shape).swapaxes(0, 1)), summed, remainder, len(senders.area))
+
+
+def _solve(
+    tracer: Tracer,
+    atlas: Atlas,
+    senders: Senders,
+    direct: Float32[np.ndarray, "lightings texels 3"],
+    pattern: Float32[np.ndarray, "samples 4"],
+    rng: np.random.Generator,
+    bounces: int,
+) -> tuple[Float32[np.ndarray, "senders columns"], int, float]:
+    """Radiosity R (E0 + G R E0 + ...) of every sender, the bounces it holds, and the share left out."""
+    count, lightings = len(senders.area), len(direct)
+    term = _mean_over_senders(senders, atlas, direct)
+    albedo = np.tile(senders.albedo.astype(np.float32), (1, lightings))
+    total = term.copy()
+    largest = float(senders.albedo.max())
+    if bounces == 1 or largest == 0:
+        return albedo * total, 1, _remainder(largest, term, total)
+    gather = np.empty((count, count), np.float32)
+    for tile, rows in _rows(tracer, atlas, senders, senders.sampler, pattern, rng.random((count, 4), np.float32)):
+        gather[tile] = rows
+    summed, left = 1, np.inf
+    while (left > _TOLERANCE if bounces < 0 else summed < bounces) and summed < _MAX_BOUNCES:
+        term = gather @ (albedo * term)
+        total += term
+        summed += 1
+        left = _remainder(largest, term, total)
+    return albedo * total, summed, left
+
+
+def _remainder(largest: float, term: np.ndarray, total: np.ndarray) -> float:
+    """Bound on the light of all further terms: rows of G sum to at most 1, so each is at most `largest` times the last."""
+    peak = total.max(0)
+    ratio = np.divide(term.max(0), peak, out=np.zeros_like(peak), where=peak > 0).max(initial=0)
+    return float(ratio * largest / (1 - largest)) if largest < 1 else float("inf" if ratio > 0 else 0)
+
+
+def _mean_over_senders(
+    senders: Senders, atlas: Atlas, direct: Float32[np.ndarray, "lightings texels 3"]
+) -> Float32[np.ndarray, "senders columns"]:
+    from scipy.sparse import csr_array
+
+    share = (atlas.area / senders.area[senders.of_texel]).astype(np.float32)
+    mean = csr_array((share, (senders.of_texel, np.arange(atlas.count))), shape=(len(senders.area), atlas.count))
+    return mean @ np.ascontiguousarray(direct.swapaxes(0, 1)).reshape(atlas.count, -1)
+
+
+def _rows(
+    tracer: Tracer,
+    atlas: Atlas,
+    senders: Senders,
+    receivers: SurfaceSampler,
+    pattern: Float32[np.ndarray, "samples 4"],
+    shifts: Float32[np.ndarray, "receivers 4"],
+):  # type: ignore[no-untyped-def]
+    """Tiles of G in order: (receiver slice, shares of the hemisphere that see each sender)."""
+    samples, count = len(pattern), len(senders.area)
+    size = max(1, _TILE_RAYS // samples)
+    to_sender = np.where(atlas.lookup >= 0, senders.of_texel[atlas.lookup], -1).astype(np.int32)
+    corner = (atlas.uv[:, 0] * atlas.resolution).astype(np.float32)
+    edges = ((atlas.uv[:, 1:] - atlas.uv[:, :1]) * atlas.resolution).astype(np.float32)
+
+    def work(first: int) -> tuple[slice, Float32[np.ndarray, "tile senders"]]:
+        last = min(first + size, len(shifts))
+        rows = np.zeros((last - first) * count, np.int64)
+        for start in range(0, samples, _TILE_RAYS):
+            u = pattern[None, start : start + _TILE_RAYS] + shifts[first:last, None]
+            u -= np.floor(u)
+            receiver = np.repeat(np.arange(last - first), u.shape[1])
+            seen = _senders_seen(tracer, receivers, first + receiver, u.reshape(-1, 4), to_sender, corner, edges)
+            flat = (receiver * count + seen)[seen >= 0]
+            rows += np.bincount(flat, minlength=len(rows))
+        return slice(first, last), (rows.reshape(-1, count) * np.float32(1 / samples)).astype(np.float32)
+
+    return tracer.map(work, range(0, len(shifts), size))
+
+
+def _senders_seen(
+    tracer: Tracer,
+    receivers: SurfaceSampler,
+    receiver: Int[np.ndarray, " rays"],
+    u: Float32[np.ndarray, "rays 4"],
+    to_sender: Int32[np.ndarray, "height width"],
+    corner: Float32[np.ndarray, "triangles 2"],
+    edges: Float32[np.ndarray, "triangles 2 2"],
+) -> Int32[np.ndarray, " rays"]:
+    """Sender that one cosine-weighted ray per entry meets from its front, -1 where there is none."""
+    positions, triangle = receivers.sample(receiver, u[:, :2])
+    frames = tracer.frames[triangle]
+    directions = np.einsum("nc,ncd->nd", warp.sample_cosine(u[:, 2:]), frames)
+    hits = tracer.closest(lifted(tracer, positions, frames[:, 2]), directions)
+    met = hits.triangle
+    uv = corner[met] + hits.u[:, None] * edges[met, 0] + hits.v[:, None] * edges[met, 1]
+    texel = np.clip(uv.astype(np.int32), 0, len(to_sender) - 1)
+    return np.where(hits.front, to_sender[texel[:, 1], texel[:, 0]], -1)

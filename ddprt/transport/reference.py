@@ -1,0 +1,120 @@
+"""Unbiased path tracing of one lighting: the truth that everything else is measured against.
+
+Next-event estimation to every light at every vertex, cosine-weighted directions, depth ended by Russian roulette alone.
+Irradiance E = integral of L cos over the hemisphere = pi * mean(L) under cosine sampling, and a diffuse surface that was
+hit sends L = albedo * E_hit / pi; so one path contributes the sum over its vertices of (product of albedos) * E_direct.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ddprt import seeds, warp
+from ddprt.axes import Float32, Float64, Int, Int32
+from ddprt.lights import Lighting
+from ddprt.scene.mesh import Scene
+from ddprt.transport.direct import centred, direct_irradiance
+from ddprt.transport.embree import Tracer, lifted
+
+_BATCH = 1 << 15  # paths traced together
+_MAX_SURVIVAL = 0.95  # a white closed room would never let a path go
+
+Start = Callable[
+    [Int[np.ndarray, " n"], np.random.Generator], tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]
+]
+"""Maps receiver indices to positions (centred frame) and geometric normals."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Monte Carlo means and the variance of those means, per receiver and channel, W/m² and its square."""
+
+    direct: Float64[np.ndarray, "n 3"]
+    indirect: Float64[np.ndarray, "n 3"]
+    direct_variance: Float64[np.ndarray, "n 3"]
+    indirect_variance: Float64[np.ndarray, "n 3"]
+
+
+def trace_reference(
+    tracer: Tracer, scene: Scene, lighting: Lighting, start: Start, receivers: int, samples: int, *, seed: int, bounces: int = -1
+) -> Estimate:
+    """Estimates direct and indirect irradiance by independent paths.
+
+    Args:
+      tracer, scene: the geometry and its albedo.
+      lighting: world space.
+      start: where the paths of each receiver begin.
+      receivers: how many there are.
+      samples: paths per receiver, at least 1; the variance needs 2.
+      seed: of the paths; equal seeds give equal bits whatever the number of threads.
+      bounces: -1 follows every path to its end by roulette; otherwise at most this many.
+    """
+    lights = centred(tracer, lighting)
+    block = max(1, _BATCH // samples)
+    rounds = -(-samples // _BATCH)
+
+    def work(first: int) -> tuple[np.ndarray, np.ndarray]:
+        count = min(block, receivers - first)
+        sums, squares = np.zeros((2, count, 2, 3))
+        for turn in range(rounds):
+            rng = seeds.stream(seed, "reference", first, turn)
+            paths = min(_BATCH, samples - turn * _BATCH)
+            index = np.repeat(np.arange(first, first + count), paths)
+            values = np.stack(_paths(tracer, scene, lights, start(index, rng), rng, bounces), 1)
+            values = values.reshape(count, paths, 2, 3).astype(np.float64)
+            sums += values.sum(1)
+            squares += (values**2).sum(1)
+        return sums, squares
+
+    results = list(tracer.map(work, range(0, receivers, block)))
+    sums, squares = (np.concatenate(parts) for parts in zip(*results, strict=True))
+    mean = sums / samples
+    spread = np.maximum(squares / samples - mean**2, 0) / max(samples - 1, 1)
+    return Estimate(mean[:, 0], mean[:, 1], spread[:, 0], spread[:, 1])
+
+
+def _paths(
+    tracer: Tracer,
+    scene: Scene,
+    lights: Lighting,
+    start: tuple[np.ndarray, np.ndarray],
+    rng: np.random.Generator,
+    bounces: int,
+) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
+    """Direct and indirect contribution of one path each."""
+    positions, normals = start
+    direct = direct_irradiance(tracer, lights, positions, normals, _numbers(rng, len(lights), len(positions)))
+    indirect = np.zeros_like(direct)
+    alive = np.arange(len(positions))
+    throughput = np.ones_like(direct)
+    depth = 0
+    while len(alive) and depth != bounces:
+        frames = warp.frame(normals)
+        directions = np.einsum("nc,ncd->nd", warp.sample_cosine(rng.random((len(alive), 2), np.float32)), frames)
+        hits = tracer.closest(lifted(tracer, positions, normals), directions)
+        albedo = _albedo(scene, hits.triangle, hits.u, hits.v)
+        survival = np.minimum(albedo.max(1), _MAX_SURVIVAL)
+        keep = np.flatnonzero(hits.front & (rng.random(len(alive), np.float32) < survival))
+        alive, triangle = alive[keep], hits.triangle[keep]
+        throughput = throughput[keep] * albedo[keep] / survival[keep, None]
+        normals = tracer.normals[triangle]
+        positions = _on_triangle(tracer, triangle, hits.u[keep], hits.v[keep])
+        light = direct_irradiance(tracer, lights, positions, normals, _numbers(rng, len(lights), len(alive)))
+        indirect[alive] += throughput * light
+        depth += 1
+    return direct, indirect
+
+
+def _numbers(rng: np.random.Generator, lights: int, count: int) -> Float32[np.ndarray, "lights n 2"]:
+    return rng.random((lights, count, 2), np.float32)
+
+
+def _albedo(scene: Scene, triangle: Int32[np.ndarray, " n"], u: np.ndarray, v: np.ndarray) -> Float32[np.ndarray, "n 3"]:
+    weights = np.stack([1 - u - v, u, v], 1)
+    return scene.albedo_at(triangle, weights).astype(np.float32)
+
+
+def _on_triangle(tracer: Tracer, triangle: Int32[np.ndarray, " n"], u: np.ndarray, v: np.ndarray) -> Float32[np.ndarray, "n 3"]:
+    a, b, c = np.moveaxis(tracer.corners[triangle], 1, 0)
+    return a + u[:, None] * (b - a) + v[:, None] * (c - a)
