@@ -23,7 +23,7 @@ SELF_OFFSET = 2e-6
 """Distance between a ray's origin and its surface, as a share of the bounding box's diagonal: about 30 times the rounding
 of float32 coordinates there, and 1.6 micrometres for the Cornell box."""
 
-_PROBES = 64  # directions that tell free space from a solid's inside
+_PROBES = 256  # directions that tell free space from a solid's inside
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -119,7 +119,7 @@ class Tracer:
         """Free radius about positions in world space, metres; 0 inside a solid or behind a room's walls.
 
         A position counts as free when less than half of the surfaces it sees show their backs. The radius is that of the
-        nearest of 64 spread hits: an upper estimate of the true distance, cheap and good enough to place lamps.
+        nearest of 256 spread hits: an upper estimate of the true distance, tight to a few percent before a flat wall.
         """
         directions = warp.sample_sphere(warp.sobol(_PROBES, 2, seed=1))
         origins = np.repeat((positions - self.centre).astype(np.float32), _PROBES, 0)

@@ -1,0 +1,146 @@
+"""The transfer matrix: from measured direct light to coefficients of the basis.
+
+Belcour et al. (HPG 2022, Eq. 13 and 14) write C [D D^T + Lambda]^-1 D^T, which mixes the m x m and the N x N form; meant is
+M = C D^T (D D^T + Lambda)^-1 = C (D^T D + Lambda)^-1 D^T. With lightings as rows, X = D^T = Q S P^T, every scalar ridge
+costs one product after a single SVD: M(lambda) = C^T Q diag(S / (S² + lambda)) P^T.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ddprt.errors import UserError
+
+RANK_CUT = 1e-7
+"""Singular values below this share of the largest are rounding of the float32 measurements."""
+ILL_CONDITIONED = 1e6
+"""Condition number past which coefficients of float32 measurements are not to be trusted without a ridge."""
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """A ridge map, u = matrix (z - offset) + intercept.
+
+    Attributes:
+      matrix: M.
+      offset: mean of the measured rows, zero without intercept.
+      intercept: mean of the coefficients, zero without intercept.
+      ridge: the weight that was used; for a ridge per point its mean.
+      singular_values: of the measurements, falling.
+      condition: largest over smallest singular value; infinite where the smallest is 0.
+      rank: numerical rank of the measurements.
+      leave_one_out: root of the weighted mean squared leave-one-out residual of a row's coefficients.
+      path: leave-one-out residual at every ridge tried, as (ridge, residual) rows; empty unless it was chosen.
+      status: "ok"; "rank_deficient": some directions of the measurements carry nothing, which the ridge or the rank cut
+        leaves out; "ill_conditioned": they nearly do, and no ridge holds them back; "no_signal": nothing was measured.
+    """
+
+    matrix: Float[Array, "bases points"]
+    offset: Float[Array, " points"]
+    intercept: Float[Array, " bases"]
+    ridge: float
+    singular_values: Float[Array, " values"]
+    condition: float
+    rank: int
+    leave_one_out: float
+    path: Float[Array, "ridges 2"]
+    status: Literal["ok", "rank_deficient", "ill_conditioned", "no_signal"]
+
+
+def fit_transfer(
+    measured: Float[Array, "lightings points"],
+    coefficients: Float[Array, "lightings bases"],
+    *,
+    ridge: float | tuple[float, ...] | Literal["auto"] = "auto",
+    importance: Float[Array, " lightings"] | None = None,
+    intercept: bool = False,
+) -> Transfer:
+    """Ridge map from measurement points to basis coefficients.
+
+    Minimises ||X M^T - C||² + ridge ||M||² through one SVD of X, in float64.
+
+    Args:
+      measured: X, scaled and encoded direct light at the points, dimensionless; rows of zeros train nothing.
+      coefficients: C, those of the scaled and encoded indirect light.
+      ridge: weight in units of measured², >= 0; 0 gives the pseudo-inverse; one value per point weighs them apart;
+        "auto" minimises the leave-one-out residual.
+      importance: weight of each row's leave-one-out residual, s² to agree with errors in W/m²; 1 where it is left out.
+      intercept: fit one, by centring both sides.
+    Raises:
+      UserError: negative ridges, or not as many as points; a mix of zero and positive ridges per point.
+      ValueError: the two sides have different numbers of lightings.
+    """
+    if len(measured) != len(coefficients):
+        raise ValueError(f"got {len(measured)} rows of measurements and {len(coefficients)} of coefficients, expected as many")
+    with jax.enable_x64(True):
+        X, C = measured.astype(jnp.float64), coefficients.astype(jnp.float64)
+        weight = jnp.ones(len(X)) if importance is None else importance.astype(jnp.float64)
+        offset = jnp.mean(X, 0) if intercept else jnp.zeros(X.shape[1])
+        start = jnp.mean(C, 0) if intercept else jnp.zeros(C.shape[1])
+        per_point = _per_point(ridge, X.shape[1])
+        stretch = jnp.ones(X.shape[1]) if per_point is None else 1 / jnp.sqrt(per_point)
+        Q, S, Pt = jnp.linalg.svd((X - offset) * stretch, full_matrices=False)
+        QtC = Q.T @ (C - start)
+        # Choosing under per-point ridges: they are already in the stretched measurements, so lambda = 1.
+        path = jnp.zeros((0, 2))
+        if ridge == "auto":
+            ridges = jnp.concatenate([jnp.zeros(1), jnp.logspace(-13, 1, 57)]) * jnp.maximum(S[0] ** 2, 1e-300)
+            path = jnp.stack([ridges, _loo_path(Q, S, QtC, C - start, weight, ridges, intercept)], 1)
+            chosen = float(ridges[jnp.argmin(path[:, 1])])
+        else:
+            chosen = 1.0 if per_point is not None else float(ridge)  # type: ignore[arg-type]
+        matrix = (QtC.T * _shrink(S, chosen)) @ Pt * stretch
+        loo = float(_loo_path(Q, S, QtC, C - start, weight, jnp.array([chosen]), intercept)[0])
+        rank = int(jnp.sum(S > RANK_CUT * S[0])) if float(S[0]) > 0 else 0
+        condition = float(S[0] / S[-1]) if float(S[-1]) > 0 else float("inf")
+        status = _status(S, rank, condition, chosen)
+        used = float(jnp.mean(per_point)) if per_point is not None else chosen
+        return Transfer(
+            matrix.astype(jnp.float32), offset.astype(jnp.float32), start.astype(jnp.float32), used, S, condition, rank, loo, path, status
+        )  # fmt: skip
+
+
+def _per_point(ridge: float | tuple[float, ...] | str, points: int) -> Array | None:
+    if not isinstance(ridge, tuple):
+        return None
+    if len(ridge) != points:
+        raise UserError(f"fit.ridge: got {len(ridge)} values, expected one per measurement ({points}), a number or auto")
+    if min(ridge) <= 0:
+        raise UserError(f"fit.ridge: got {min(ridge):g} for a point, expected all above 0; use 0 alone for the pseudo-inverse")
+    return jnp.array(ridge, jnp.float64)
+
+
+def _shrink(S: Array, ridge: Array | float) -> Array:
+    """S / (S² + ridge), where directions without signal get 0: at ridge 0 this is the pseudo-inverse."""
+    held = S > RANK_CUT * S[0]
+    return jnp.where(held | (ridge > 0), S / jnp.where(S**2 + ridge > 0, S**2 + ridge, 1), 0)
+
+
+@jax.jit
+def _loo_path(
+    Q: Array, S: Array, QtC: Array, C: Array, weight: Array, ridges: Array, intercept: bool
+) -> Float[Array, " ridges"]:
+    """Leave-one-out residual of every ridge in closed form: e_k = (c_k - fitted_k) / (1 - h_kk)."""
+
+    def residual(ridge: Array) -> Array:
+        keep = S * _shrink(S, ridge)
+        leverage = (Q**2) @ keep + jnp.where(intercept, 1 / len(C), 0)
+        error = C - (Q * keep) @ QtC
+        # A row that alone decides its own fit (h = 1) says nothing about new ones: its error is its whole size.
+        free = 1 - leverage
+        left_out = jnp.where(free[:, None] > 1e-9, error / jnp.where(free > 1e-9, free, 1)[:, None], C)
+        return jnp.sqrt(jnp.sum(weight[:, None] * left_out**2) / jnp.sum(weight))
+
+    return jax.lax.map(residual, ridges)
+
+
+def _status(S: Array, rank: int, condition: float, ridge: float) -> Literal["ok", "rank_deficient", "ill_conditioned", "no_signal"]:
+    if rank == 0:
+        return "no_signal"
+    held = ridge > (RANK_CUT * float(S[0])) ** 2
+    if rank < len(S):
+        return "rank_deficient"
+    return "ill_conditioned" if condition > ILL_CONDITIONED and not held else "ok"
