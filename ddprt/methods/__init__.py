@@ -1,0 +1,50 @@
+"""Ways to get from measured light to indirect light, under one contract.
+
+Enters: scaled and encoded pairs. Leaves: a Relighter. Files, scenes and metrics never enter.
+"""
+
+from collections.abc import Mapping
+from importlib.metadata import entry_points
+from typing import Any
+
+from pydantic import ValidationError
+
+from ddprt.catalogue import Catalogue
+from ddprt.errors import UserError, nearest
+from ddprt.methods.floors import MeanLightmap, NearestLighting
+from ddprt.methods.method import Method
+from ddprt.methods.mlp import Mlp
+from ddprt.methods.svd_ridge import SvdRidge
+
+METHODS: Catalogue[type[Method]] = Catalogue(
+    "method", {"svd-ridge": SvdRidge, "mean": MeanLightmap, "nearest": NearestLighting, "mlp": Mlp}
+)
+METHODS.update({point.name: point.load() for point in entry_points(group="ddprt.methods")})
+
+
+def make_method(name: str, shared: Mapping[str, Any], own: Mapping[str, Any]) -> Method:
+    """A method with its settings.
+
+    Args:
+      name: entry of `METHODS`.
+      shared: settings of the [fit] section; each method takes those it knows.
+      own: the method's own settings, all of which it must know.
+    Raises:
+      UserError: unknown method or setting, wrong type or range.
+    """
+    method = METHODS[name]
+    known = method.model_fields
+    for setting in own:
+        if setting not in known:
+            raise UserError(
+                f"methods.settings.{name}.{setting}: unknown setting{nearest(setting, known)}; known: {', '.join(sorted(known))}"
+            )
+    try:
+        return method(**{**{key: value for key, value in shared.items() if key in known}, **own})
+    except ValidationError as error:
+        fault = error.errors()[0]
+        place = ".".join(map(str, fault["loc"]))
+        raise UserError(f"methods.settings.{name}.{place}: got {fault['input']!r}, expected: {fault['msg']}") from None
+
+
+__all__ = ["METHODS", "Method", "make_method"]

@@ -1,0 +1,160 @@
+"""The whole duty of a method, on one screen.
+
+A method is a frozen record of its settings with `fit(train, validation, *, key) -> Relighter`. A Relighter is a frozen
+dataclass of arrays, registered as a pytree, that answers `predict(frame)`. Light reaches both scaled and encoded (see
+`ddprt.fit.encoding`), so a method need not know about units, and scaling the light scales the result by construction.
+
+Laws, tested for every entry of `METHODS` (tests/test_methods.py): batch equals loop, save equals load, no second compile
+for equal shapes, no NaN for a dark lighting, twice the light is twice the result, and on its own validation set better than
+the mean lightmap or `FitReport.status` says so.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from pydantic import BaseModel, ConfigDict
+
+STATUSES = {
+    "ok": "Nothing to remark.",
+    "rank_deficient": "The data has fewer independent directions than were asked for, so fewer bases (or measurements) are in "
+    "use. Likely causes: few or similar lightings, points that see the same light. More varied lightings help.",
+    "ill_conditioned": "Some measurements nearly repeat each other and no ridge holds them back, so rounding is amplified. "
+    'Use ridge = "auto" or points further apart.',
+    "no_signal": "Nothing was measured or no indirect light exists; the result is black. Check that lamps reach the scene and "
+    "that its surfaces face each other.",
+    "worse_than_mean": "On the validation lightings this method does worse than the mean lightmap. More training lightings or "
+    "steps may help; do not ship it.",
+}
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What an engine has at hand.
+
+    Attributes:
+      values: measured light at the points, scaled and encoded.
+      positions, normals: of the points, metres and unit vectors.
+      lightings: the lights themselves, for methods that ask for them.
+    """
+
+    values: Float[Array, "frames points 3"]
+    positions: Float[Array, "points 3"]
+    normals: Float[Array, "points 3"]
+    lightings: Sequence[Any] | None = None
+
+
+@dataclass(frozen=True)
+class Examples:
+    """Pairs to learn from, lightings first.
+
+    Attributes:
+      frame: measurements of all lightings.
+      indirect: scaled and encoded indirect light.
+      scale: s of each lighting and channel; errors in W/m² are s times encoded ones.
+      area: of the texels, m².
+      weights: share of each texel in errors, summing to 1.
+      channels: "mono" or "multi": whether colours are separate columns.
+    """
+
+    frame: Frame
+    indirect: Float[Array, "lightings texels 3"]
+    scale: Float[Array, "lightings 3"]
+    area: Float[np.ndarray, " texels"]
+    weights: str = "area"
+    channels: str = "mono"
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """What a fit says about itself; per-channel values have one entry per transfer matrix (3 for mono, 1 for multi)."""
+
+    status: str = "ok"
+    bases: int = 0
+    numerical_rank: int = 0
+    condition: tuple[float, ...] = ()
+    ridge: tuple[float, ...] = ()
+    ridge_chosen_by: str = ""
+    singular_values: tuple[float, ...] = ()
+    ridge_path: tuple[tuple[tuple[float, float], ...], ...] = ()
+    loss: tuple[tuple[int, float, float], ...] = ()
+
+
+class Relighter(Protocol):
+    """What a fit leaves: everything needed to answer a frame."""
+
+    report: FitReport
+
+    def predict(self, frame: Frame) -> Float[Array, "frames texels 3"]:
+        """Encoded indirect light; linear in nothing by contract, NaN for nothing."""
+        ...
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that ship."""
+        ...
+
+    @property
+    def flops(self) -> int:
+        """Floating-point operations per frame."""
+        ...
+
+
+class Method(BaseModel):
+    """Base of the methods' settings records."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    relighter: ClassVar[type]
+    why: ClassVar[str]
+
+    def fit(self, train: Examples, validation: Examples, *, key: Array) -> Relighter:
+        """Learns from `train`; `validation` may stop it early; `key` is its only randomness."""
+        raise NotImplementedError
+
+
+def as_pytree(cls: type) -> type:
+    """Registers a Relighter: arrays (or tuples of them, or None) are data, the rest is static, the report is dropped."""
+    data = [entry.name for entry in fields(cls) if not entry.metadata.get("static") and entry.name != "report"]
+    static = [entry.name for entry in fields(cls) if entry.metadata.get("static")]
+    return jax.tree_util.register_dataclass(cls, data_fields=data, meta_fields=static, drop_fields=["report"])
+
+
+def static(**options: Any) -> Any:
+    """A field that is part of the structure rather than an array."""
+    return field(metadata={"static": True}, **options)
+
+
+def array_bytes(relighter: Any) -> int:
+    """Bytes of all arrays."""
+    return sum(leaf.nbytes for leaf in jax.tree_util.tree_leaves(relighter))
+
+
+def columns(examples: Examples) -> tuple[Float[Array, "columns entries"], Float[Array, " columns"]]:
+    """Indirect light as rows of the basis' data, and the scale of each.
+
+    Mono channel gives a row per lighting and channel (all channels share one basis), multi channel one row per lighting
+    with colours interleaved. Dark rows are left out.
+    """
+    values, scale = examples.indirect, examples.scale
+    if examples.channels == "mono":
+        rows, size = jnp.moveaxis(values, 2, 1).reshape(-1, values.shape[1]), scale.reshape(-1)
+    else:
+        rows, size = values.reshape(len(values), -1), scale[:, 0]
+    lit = np.flatnonzero(np.asarray(size) > 0)
+    return (rows, size) if len(lit) == len(size) else (rows[lit], size[lit])
+
+
+def measurements(examples: Examples) -> Float[Array, "groups lightings inputs"]:
+    """Measured values per transfer matrix: one group per channel for mono, one of interleaved colours for multi."""
+    values = examples.frame.values
+    return jnp.moveaxis(values, 2, 0) if examples.channels == "mono" else values.reshape(1, len(values), -1)
+
+
+def validation_error(relighter: Relighter, examples: Examples) -> float:
+    """Weighted squared error of encoded light in units of W/m²; what "better than the mean" compares."""
+    error = (relighter.predict(examples.frame) - examples.indirect) * examples.scale[:, None]
+    return float(jnp.mean(jnp.einsum("ltc,t->lc", error**2, jnp.asarray(examples.area / examples.area.sum(), jnp.float32))))

@@ -1,0 +1,159 @@
+"""A first learned rival: a small network from measurements to coefficients of the SVD basis, trained with optax.
+
+Same basis, same split and same metrics as the baseline, so the comparison exists from the first day.
+"""
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float
+from pydantic import Field
+
+from ddprt.fit.basis import entry_weights, fit_basis
+from ddprt.methods.method import Examples, FitReport, Frame, Method, array_bytes, as_pytree, columns, measurements, static
+
+Layers = tuple[tuple[Float[Array, "inputs outputs"], Float[Array, " outputs"]], ...]
+
+
+@as_pytree
+@dataclass(frozen=True)
+class Perceptron:
+    """Dense layers with GELU between them, then the basis; channels are told apart by a one-hot input."""
+
+    weights: tuple[Float[Array, "inputs outputs"], ...]
+    biases: tuple[Float[Array, " outputs"], ...]
+    basis: Float[Array, "bases entries"]
+    spread: Float[Array, " bases"]
+    groups: int = static(default=3)
+    report: FitReport = field(default=FitReport(), compare=False)
+
+    def predict(self, frame: Frame) -> Float[Array, "frames texels 3"]:
+        """See `Relighter`."""
+        frames = len(frame.values)
+        values = jnp.moveaxis(frame.values, 2, 1) if self.groups == 3 else frame.values.reshape(frames, 1, -1)
+        coefficients = _forward(tuple(zip(self.weights, self.biases, strict=True)), values) * self.spread
+        light = jnp.matmul(coefficients, self.basis, precision="highest")
+        return jnp.moveaxis(light, 1, 2) if self.groups == 3 else light.reshape(frames, -1, 3)
+
+    @property
+    def nbytes(self) -> int:
+        """See `Relighter`."""
+        return array_bytes(self)
+
+    @property
+    def flops(self) -> int:
+        """See `Relighter`."""
+        return 2 * self.groups * (sum(int(w.size) for w in self.weights) + int(self.basis.size))
+
+
+class Mlp(Method):
+    """Network from measurements to coefficients."""
+
+    relighter: ClassVar[type] = Perceptron
+    why: ClassVar[str] = "learned: does a nonlinear map beat the ridge on the same basis?"
+    bases: int = Field(16, ge=1)
+    width: int = Field(128, ge=1, le=4096)
+    depth: int = Field(2, ge=1, le=16)
+    steps: int = Field(2000, ge=1)
+    learning_rate: float = Field(2e-3, gt=0)
+    weight_decay: float = Field(1e-4, ge=0)
+    check_every: int = Field(50, ge=1)
+
+    def fit(self, train: Examples, validation: Examples, *, key: Array) -> Perceptron:
+        """See `Method`: full-batch AdamW with a cosine schedule; keeps the weights that were best on `validation`."""
+        rows, _ = columns(train)
+        entries = jnp.asarray(entry_weights(train.area, train.weights, train.channels))  # type: ignore[arg-type]
+        basis = fit_basis(rows, entries, bases=self.bases)
+        inputs, targets, importance = _pairs(train, basis.vectors, entries)
+        spread = jnp.maximum(jnp.sqrt(jnp.mean(targets**2, (0, 1))), 1e-12)
+        checked = _pairs(validation, basis.vectors, entries)
+        layers = self._initial(inputs.shape[1] + inputs.shape[2], len(spread), key)
+        optimiser = optax.chain(
+            optax.clip_by_global_norm(1.0),
+            optax.adamw(optax.cosine_decay_schedule(self.learning_rate, self.steps), weight_decay=self.weight_decay),
+        )
+        rounds = max(1, self.steps // self.check_every)
+        layers, losses = _train(
+            layers, (inputs, targets / spread, importance), (checked[0], checked[1] / spread, checked[2]), spread, optimiser,
+            rounds, min(self.check_every, self.steps),
+        )  # fmt: skip
+        history = tuple((int(i + 1) * self.check_every, float(a), float(b)) for i, (a, b) in enumerate(np.asarray(losses)))
+        finite = all(np.isfinite(row).all() for row in history)
+        report = FitReport(
+            status="no_signal" if basis.rank == 0 else basis.status if finite else "worse_than_mean",
+            bases=len(spread),
+            numerical_rank=basis.rank,
+            singular_values=tuple(np.asarray(basis.singular_values).tolist()),
+            loss=history,
+        )
+        weights, biases = zip(*layers, strict=True)
+        return Perceptron(weights, biases, basis.vectors, spread, inputs.shape[1], report)
+
+    def _initial(self, inputs: int, outputs: int, key: Array) -> Layers:
+        sizes = [inputs, *[self.width] * self.depth, outputs]
+        keys = jax.random.split(key, len(sizes) - 1)
+        start = jax.nn.initializers.he_normal()
+        return tuple((start(k, (a, b), jnp.float32), jnp.zeros(b)) for k, a, b in zip(keys, sizes[:-1], sizes[1:], strict=True))
+
+
+def _pairs(examples: Examples, vectors: Array, entries: Array) -> tuple[Array, Array, Array]:
+    """(lightings, groups, inputs), (lightings, groups, bases) and (lightings, groups) importance, mean 1."""
+    inputs = jnp.moveaxis(measurements(examples), 0, 1)
+    light = examples.indirect
+    rows = jnp.moveaxis(light, 2, 1) if inputs.shape[1] == 3 else light.reshape(len(light), 1, -1)
+    targets = jnp.matmul(rows * entries, vectors.T, precision="highest")
+    importance = examples.scale[:, : inputs.shape[1]] ** 2
+    return inputs, targets, importance / jnp.maximum(jnp.mean(importance), 1e-30)
+
+
+def _forward(layers: Layers, values: Float[Array, "frames groups inputs"]) -> Float[Array, "frames groups bases"]:
+    frames, groups = values.shape[:2]
+    which = jnp.broadcast_to(jnp.eye(groups, dtype=values.dtype), (frames, groups, groups))
+    # Unit-norm measurements are small numbers; this brings them to about 1.
+    hidden = jnp.concatenate([values * jnp.sqrt(values.shape[2]), which], -1)
+    for weight, bias in layers[:-1]:
+        hidden = jax.nn.gelu(hidden @ weight + bias)
+    weight, bias = layers[-1]
+    return hidden @ weight + bias
+
+
+def _train(
+    layers: Layers,
+    train: tuple[Array, Array, Array],
+    validation: tuple[Array, Array, Array],
+    spread: Array,
+    optimiser: optax.GradientTransformation,
+    rounds: int,
+    steps: int,
+) -> tuple[Layers, Array]:
+    """All of training as one compiled loop; returns the best layers and (train, validation) loss per round."""
+    share = spread**2 / jnp.sum(spread**2)
+
+    def loss(layers: Layers, data: tuple[Array, Array, Array]) -> Array:
+        inputs, targets, importance = data
+        return jnp.mean(importance[..., None] * share * (_forward(layers, inputs) - targets) ** 2)
+
+    def step(state: tuple[Layers, optax.OptState], _: None) -> tuple[tuple[Layers, optax.OptState], None]:
+        layers, optimiser_state = state
+        updates, optimiser_state = optimiser.update(jax.grad(loss)(layers, train), optimiser_state, layers)
+        return (optax.apply_updates(layers, updates), optimiser_state), None
+
+    def one_round(carry: tuple, _: None) -> tuple[tuple, Array]:
+        state, best, lowest = carry
+        state, _ = jax.lax.scan(step, state, None, length=steps)
+        now = loss(state[0], validation)
+        better = now < lowest
+        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), state[0], best)
+        return (state, best, jnp.where(better, now, lowest)), jnp.stack([loss(state[0], train), now])
+
+    @jax.jit
+    def run(layers: Layers) -> tuple[Layers, Array]:
+        start = ((layers, optimiser.init(layers)), layers, jnp.inf)
+        (_, best, _), losses = jax.lax.scan(one_round, start, None, length=rounds)
+        return best, losses
+
+    return run(layers)
