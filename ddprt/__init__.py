@@ -1,3 +1,54 @@
-"""Data-driven precomputed radiance transfer."""
+"""Data-driven precomputed radiance transfer: learn how a scene answers to light, relight it without tracing a ray.
+
+Everything the command line does, in plain Python:
+
+    scene = ddprt.load_scene("cornell")
+    data  = ddprt.bake(scene, resolution=128)
+    model = ddprt.fit(data, bases=16)
+    image = model.relight({"type": "point", "position": [0.3, 0.4, 0.2], "intensity": [1, 1, 1]})
+
+Names are loaded when they are first used; importing this package is instant and imports no JAX.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from ddprt.dataset.generate import bake as bake
+    from ddprt.dataset.store import open_dataset as open_dataset
+    from ddprt.errors import UserError as UserError
+    from ddprt.lights import load_lightings as load_lightings
+    from ddprt.methods import METHODS as METHODS
+    from ddprt.runtime.model_file import load_model as load_model
+    from ddprt.runtime.train import fit as fit
+    from ddprt.scene.files import load_scene as load_scene
+    from ddprt.scene.library import SCENES as SCENES
+    from ddprt.transport.effects import plan as plan
+    from ddprt.transport.irradiance import irradiance as irradiance
+
+_HOMES = {
+    "METHODS": "ddprt.methods",
+    "SCENES": "ddprt.scene.library",
+    "UserError": "ddprt.errors",
+    "bake": "ddprt.dataset.generate",
+    "fit": "ddprt.runtime.train",
+    "irradiance": "ddprt.transport.irradiance",
+    "load_lightings": "ddprt.lights",
+    "load_model": "ddprt.runtime.model_file",
+    "load_scene": "ddprt.scene.files",
+    "open_dataset": "ddprt.dataset.store",
+    "plan": "ddprt.transport.effects",
+}
+__all__ = ["__version__", *sorted(_HOMES)]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'ddprt' has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

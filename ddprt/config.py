@@ -104,7 +104,7 @@ class TransportConfig(Section):
     test_samples: int = Field(1024, ge=2, le=131072, description="gather rays per texel for held-out lightings, in two halves")
     direct_samples: int = Field(4, ge=1, le=1024, description="shadow rays per texel and light")
     sender_resolution: int = Field(
-        0, ge=0, le=1024, description="texels per side of the coarser atlas that light bounces off; 0 chooses min(resolution, 128)"
+        0, ge=0, le=1024, description="texels per side of the coarser atlas that light bounces off; 0 chooses min(resolution, 64)"
     )
     bounces: int = Field(-1, ge=-1, description="-1: as many as the scene calls for; 0, 1, 2...: forced, and reported")
     threads: int = Field(0, ge=0, description="0: one per core")

@@ -101,6 +101,17 @@ def frame(normal: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
     return np.stack([tangent, bitangent, normal], -2)
 
 
+def to_world(
+    local: Float[np.ndarray, "n 3"], frames: Float[np.ndarray, "n 3 3"] | Float[np.ndarray, "n 9"]
+) -> Float[np.ndarray, "n 3"]:
+    """Directions about +z turned into the frames that `frame` makes, a column at a time."""
+    rows, (x, y, z) = frames.reshape(-1, 9), np.ascontiguousarray(local.T)
+    world = np.empty_like(local)
+    for axis in range(3):
+        world[:, axis] = x * rows[:, axis] + y * rows[:, 3 + axis] + z * rows[:, 6 + axis]
+    return world
+
+
 def sobol(count: int, dimensions: int, seed: int) -> Float32[np.ndarray, "count dimensions"]:
     """Owen-scrambled Sobol points in [0, 1); any count is allowed, powers of two are the best balanced."""
     engine = qmc.Sobol(dimensions, scramble=True, rng=seed)

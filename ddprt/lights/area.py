@@ -80,7 +80,7 @@ class SphereLight(LightModel):
         sine2 = np.minimum(sine2, 1).astype(dtype)
         cap = sine2 / (1 + np.sqrt(1 - sine2))  # 1 - cos(theta_max), free of cancellation for far lamps
         local = warp.sample_cone(u.astype(dtype), cap)
-        direction = np.einsum("nc,ncd->nd", local, warp.frame(unit(away)))
+        direction = warp.to_world(local, warp.frame(unit(away)))
         along = np.einsum("nd,nd->n", direction, away)
         chord = np.sqrt(np.maximum(self.radius**2 - (squared - along**2), 0))
         solid_angle = np.where(outside, 2 * np.pi * cap, 0).astype(dtype)

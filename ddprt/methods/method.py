@@ -2,7 +2,7 @@
 
 A method is a frozen record of its settings with `fit(train, validation, *, key) -> Relighter`. A Relighter is a frozen
 dataclass of arrays, registered as a pytree, that answers `predict(frame)`. Light reaches both scaled and encoded (see
-`ddprt.fit.encoding`), so a method need not know about units, and scaling the light scales the result by construction.
+`ddprt.fitting.encoding`), so a method need not know about units, and scaling the light scales the result by construction.
 
 Laws, tested for every entry of `METHODS` (tests/test_methods.py): batch equals loop, save equals load, no second compile
 for equal shapes, no NaN for a dark lighting, twice the light is twice the result, and on its own validation set better than

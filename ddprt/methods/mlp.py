@@ -13,7 +13,7 @@ import optax
 from jaxtyping import Array, Float
 from pydantic import Field
 
-from ddprt.fit.basis import entry_weights, fit_basis
+from ddprt.fitting.basis import entry_weights, fit_basis
 from ddprt.methods.method import Examples, FitReport, Frame, Method, array_bytes, as_pytree, columns, measurements, static
 
 Layers = tuple[tuple[Float[Array, "inputs outputs"], Float[Array, " outputs"]], ...]

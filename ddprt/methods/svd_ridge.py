@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from pydantic import Field
 
-from ddprt.fit.basis import entry_weights, fit_basis
-from ddprt.fit.transfer import fit_transfer
+from ddprt.fitting.basis import entry_weights, fit_basis
+from ddprt.fitting.transfer import fit_transfer
 from ddprt.methods.method import Examples, FitReport, Frame, Method, array_bytes, as_pytree, columns, measurements
 
 

@@ -21,15 +21,14 @@ class SurfaceSampler:
       start: first piece of each group, and the number of pieces at the end.
       reach: group index plus the share of the group's area up to and with this piece: rising from 0 to the group count.
       width: share of its group's area that each piece has.
-      corner: first corner of each piece, metres; `edges` lead to the other two.
+      place: first corner of each piece and the edges to the other two, nine numbers in a row, metres.
       triangle: mesh triangle of each piece.
     """
 
     start: Int[np.ndarray, " groups_and_end"]
     reach: Float64[np.ndarray, " pieces"]
     width: Float64[np.ndarray, " pieces"]
-    corner: Float32[np.ndarray, "pieces 3"]
-    edges: Float32[np.ndarray, "pieces 2 3"]
+    place: Float32[np.ndarray, "pieces 9"]
     triangle: Int32[np.ndarray, " pieces"]
 
     @classmethod
@@ -49,7 +48,8 @@ class SurfaceSampler:
         before = running[start[:-1]] - area[start[:-1]]
         reach = group + np.clip((running - before[group]) / total[group], 0, 1)
         reach[start[1:] - 1] = group[start[1:] - 1] + 1
-        return cls(start, reach, area / total[group], corners[:, 0], corners[:, 1:] - corners[:, :1], triangle)
+        place = np.concatenate([corners[:, :1], corners[:, 1:] - corners[:, :1]], 1).reshape(-1, 9)
+        return cls(start, reach, area / total[group], place, triangle)
 
     def sample(
         self, group: Int[np.ndarray, " n"], u: Float32[np.ndarray, "n 2"]
@@ -57,15 +57,17 @@ class SurfaceSampler:
         """Positions (metres) and mesh triangles, one in each given group; groups in rising order are fastest."""
         first, last = self.start[group.min()], self.start[group.max() + 1]
         choice = group + u[:, 0].astype(np.float64)
-        piece = np.minimum(first + np.searchsorted(self.reach[first:last], choice, side="right"), self.start[group + 1] - 1)
-        width = self.width[piece]
-        rescaled = np.clip((choice - self.reach[piece] + width) / np.maximum(width, 1e-300), 0, 1).astype(np.float32)
-        weights = warp.sample_triangle(np.stack([rescaled, u[:, 1]], 1))
-        edges = self.edges[piece]
-        return (
-            self.corner[piece] + weights[:, :1] * edges[:, 0] + weights[:, 1:] * edges[:, 1],
-            self.triangle[piece],
-        )
+        piece = first + np.searchsorted(self.reach[first:last], choice, side="right")
+        piece = np.minimum(piece, np.take(self.start, group + 1) - 1)
+        width = np.take(self.width, piece)
+        within = (choice - np.take(self.reach, piece) + width) / np.maximum(width, 1e-300)
+        weights = warp.sample_triangle(np.stack([np.clip(within, 0, 1).astype(np.float32), u[:, 1]], 1))
+        second, third = np.ascontiguousarray(weights.T)
+        place = np.take(self.place, piece, axis=0)
+        positions = np.empty((len(group), 3), np.float32)
+        for axis in range(3):  # a column at a time: three times as fast as broadcasting over rows of three
+            positions[:, axis] = place[:, axis] + second * place[:, 3 + axis] + third * place[:, 6 + axis]
+        return positions, np.take(self.triangle, piece)
 
 
 @dataclass(frozen=True)

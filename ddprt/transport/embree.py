@@ -94,7 +94,8 @@ class Tracer:
             np.ascontiguousarray(origins), np.ascontiguousarray(directions), query="INTERSECT", output=True
         )
         triangle = found["primID"]
-        front = np.einsum("nd,nd->n", self.normals[triangle], directions) < 0
+        normals = np.take(self.normals, triangle, axis=0, mode="wrap")
+        front = np.einsum("nd,nd->n", normals, directions) < 0
         return Hits(triangle, found["u"], found["v"], front & (triangle >= 0), found["tfar"])
 
     def unoccluded(

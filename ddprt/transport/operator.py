@@ -137,8 +137,9 @@ def _rows(
     samples, count = len(pattern), len(senders.area)
     size = max(1, _TILE_RAYS // samples)
     to_sender = np.where(atlas.lookup >= 0, senders.of_texel[atlas.lookup], -1).astype(np.int32)
-    corner = (atlas.uv[:, 0] * atlas.resolution).astype(np.float32)
-    edges = ((atlas.uv[:, 1:] - atlas.uv[:, :1]) * atlas.resolution).astype(np.float32)
+    edges = atlas.uv[:, 1:] - atlas.uv[:, :1]
+    charts = np.concatenate([atlas.uv[:, :1], edges], 1).reshape(-1, 6) * atlas.resolution
+    charts = charts.astype(np.float32)
 
     def work(first: int) -> tuple[slice, Float32[np.ndarray, "tile senders"]]:
         last = min(first + size, len(shifts))
@@ -147,7 +148,7 @@ def _rows(
             u = pattern[None, start : start + _TILE_RAYS] + shifts[first:last, None]
             u -= np.floor(u)
             receiver = np.repeat(np.arange(last - first), u.shape[1])
-            seen = _senders_seen(tracer, receivers, first + receiver, u.reshape(-1, 4), to_sender, corner, edges)
+            seen = _senders_seen(tracer, receivers, first + receiver, u.reshape(-1, 4), to_sender, charts)
             flat = (receiver * count + seen)[seen >= 0]
             rows += np.bincount(flat, minlength=len(rows))
         return slice(first, last), (rows.reshape(-1, count) * np.float32(1 / samples)).astype(np.float32)
@@ -161,15 +162,15 @@ def _senders_seen(
     receiver: Int[np.ndarray, " rays"],
     u: Float32[np.ndarray, "rays 4"],
     to_sender: Int32[np.ndarray, "height width"],
-    corner: Float32[np.ndarray, "triangles 2"],
-    edges: Float32[np.ndarray, "triangles 2 2"],
+    charts: Float32[np.ndarray, "triangles 6"],
 ) -> Int32[np.ndarray, " rays"]:
     """Sender that one cosine-weighted ray per entry meets from its front, -1 where there is none."""
     positions, triangle = receivers.sample(receiver, u[:, :2])
-    frames = tracer.frames[triangle]
-    directions = np.einsum("nc,ncd->nd", warp.sample_cosine(u[:, 2:]), frames)
-    hits = tracer.closest(lifted(tracer, positions, frames[:, 2]), directions)
-    met = hits.triangle
-    uv = corner[met] + hits.u[:, None] * edges[met, 0] + hits.v[:, None] * edges[met, 1]
-    texel = np.clip(uv.astype(np.int32), 0, len(to_sender) - 1)
-    return np.where(hits.front, to_sender[texel[:, 1], texel[:, 0]], -1)
+    frames = np.take(tracer.frames.reshape(-1, 9), triangle, axis=0)
+    directions = warp.to_world(warp.sample_cosine(u[:, 2:]), frames)
+    hits = tracer.closest(lifted(tracer, positions, frames[:, 6:]), directions)
+    chart = np.take(charts, hits.triangle, axis=0, mode="wrap")
+    column, row = (chart[:, k] + hits.u * chart[:, 2 + k] + hits.v * chart[:, 4 + k] for k in (0, 1))
+    side = len(to_sender)
+    texel = np.clip(row.astype(np.int32), 0, side - 1) * side + np.clip(column.astype(np.int32), 0, side - 1)
+    return np.where(hits.front, np.take(to_sender, texel), -1)

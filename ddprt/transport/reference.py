@@ -13,6 +13,7 @@ import numpy as np
 from ddprt import seeds, warp
 from ddprt.axes import Float32, Float64, Int, Int32
 from ddprt.lights import Lighting
+from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
 from ddprt.transport.direct import centred, direct_irradiance
 from ddprt.transport.embree import Tracer, lifted
@@ -91,7 +92,7 @@ def _paths(
     depth = 0
     while len(alive) and depth != bounces:
         frames = warp.frame(normals)
-        directions = np.einsum("nc,ncd->nd", warp.sample_cosine(rng.random((len(alive), 2), np.float32)), frames)
+        directions = warp.to_world(warp.sample_cosine(rng.random((len(alive), 2), np.float32)), frames)
         hits = tracer.closest(lifted(tracer, positions, normals), directions)
         albedo = _albedo(scene, hits.triangle, hits.u, hits.v)
         survival = np.minimum(albedo.max(1), _MAX_SURVIVAL)
@@ -118,3 +119,21 @@ def _albedo(scene: Scene, triangle: Int32[np.ndarray, " n"], u: np.ndarray, v: n
 def _on_triangle(tracer: Tracer, triangle: Int32[np.ndarray, " n"], u: np.ndarray, v: np.ndarray) -> Float32[np.ndarray, "n 3"]:
     a, b, c = np.moveaxis(tracer.corners[triangle], 1, 0)
     return a + u[:, None] * (b - a) + v[:, None] * (c - a)
+
+
+def on_texels(tracer: Tracer, atlas: Atlas, texels: Int[np.ndarray, " receivers"]) -> Start:
+    """Paths that begin anywhere in a texel, uniform by area: the estimate is the texel's mean irradiance."""
+
+    def start(index: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        positions, triangle = atlas.sampler.sample(texels[index], rng.random((len(index), 2), np.float32))
+        return positions, tracer.normals[triangle]
+
+    return start
+
+
+def on_points(
+    tracer: Tracer, positions: Float64[np.ndarray, "receivers 3"], normals: Float64[np.ndarray, "receivers 3"]
+) -> Start:
+    """Paths that begin at given world-space points."""
+    local, facing = (positions - tracer.centre).astype(np.float32), normals.astype(np.float32)
+    return lambda index, rng: (local[index], facing[index])

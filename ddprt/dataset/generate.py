@@ -1,0 +1,336 @@
+"""Bakes a dataset: many lightings, in parallel, resumable.
+
+What a stage needs is read back from the files of the stage before it, never from memory: an interrupted bake that goes on
+gives the same bits as one that was never stopped.
+"""
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ddprt import __version__, seeds
+from ddprt.config import Config
+from ddprt.dataset import store
+from ddprt.dataset.store import Dataset, Manifest, map_name
+from ddprt.errors import UserError
+from ddprt.lights import Lighting, lighting_json, load_lightings
+from ddprt.progress import Progress
+from ddprt.sampling.lightings import draw_lightings
+from ddprt.sampling.points import Samples, load_samples, place_samples
+from ddprt.scene.atlas import Atlas, build_atlas
+from ddprt.scene.mesh import Scene
+from ddprt.transport.direct import centred, direct_irradiance
+from ddprt.transport.effects import Plan, plan
+from ddprt.transport.embree import Tracer
+from ddprt.transport.measure import measure
+
+_SENDER_RESOLUTION = 64  # senders along a side where transport.sender_resolution leaves it open
+
+Splits = Mapping[str, Sequence[Lighting]]
+
+
+def bake(
+    scene: Scene,
+    lightings: Sequence[Lighting] | Splits | None = None,
+    *,
+    resolution: int = 256,
+    samples: int = 256,
+    seed: int = 0,
+    config: Config | None = None,
+    out: str | Path | None = None,
+    progress: Progress | None = None,
+) -> Dataset:
+    """Renders pairs of direct and indirect lightmaps.
+
+    Args:
+      scene: from `ddprt.load_scene`.
+      lightings: a mapping of "train", "validation" and "test" to lightings; or one list, of which the last fifth becomes test
+        and the tenth before it validation; or None to draw them as the configuration says.
+      resolution: texels per side of the lightmap.
+      samples: gather rays per texel (twice as many for held-out lightings).
+      seed: of all random numbers.
+      config: all settings at once; replaces `resolution`, `samples` and `seed`.
+      out: folder; an unfinished bake of the same settings there goes on. None bakes into a temporary folder that lives as
+        long as the dataset.
+      progress: shown if given.
+    Returns:
+      The finished dataset.
+    Raises:
+      UserError: no lightings, all of them dark, too many points, or a folder that holds another dataset.
+    """
+    if config is None:
+        transport = {"samples": samples, "test_samples": 2 * samples}
+        config = Config.model_validate({"seed": seed, "atlas": {"resolution": resolution}, "transport": transport})
+    keep_alive = tempfile.TemporaryDirectory(prefix="ddprt-") if out is None else None
+    folder = Path(keep_alive.name if keep_alive else str(out))
+    return _Bake(scene, config, folder, progress or Progress(quiet=True)).run(lightings, keep_alive)
+
+
+def split_lightings(lightings: Sequence[Lighting]) -> dict[str, list[Lighting]]:
+    """One list into train, validation and test by order: the last fifth is test, the tenth before it validation."""
+    count = len(lightings)
+    if count < 3:
+        raise UserError(f"lightings: got {count}, expected at least 3 (train, validation, test)")
+    test, validation = max(1, count // 5), max(1, count // 10)
+    first = count - test - validation
+    return {"train": [*lightings[:first]], "validation": [*lightings[first:-test]], "test": [*lightings[-test:]]}
+
+
+class _Bake:
+    """One bake from start to end; every stage skips what the manifest already holds."""
+
+    def __init__(self, scene: Scene, config: Config, folder: Path, progress: Progress) -> None:
+        self.scene, self.config, self.folder, self.progress = scene, config, folder, progress
+        self.tracer = Tracer.of(scene, config.transport.threads)
+
+    def run(self, given: Sequence[Lighting] | Splits | None, keep_alive: Any) -> Dataset:
+        with self.progress.stage("lightings") as stage:
+            entries, drawn = self._entries(given)
+            self._warn_of_blocked(entries)
+            stage.facts |= {"lightings": len(entries), **drawn}
+        effects = plan(self.scene, [lighting for _, lighting in entries], bounces=self.config.transport.bounces)
+        description = self._description(entries, effects, drawn)
+        self._claim(description)
+        manifest = Manifest(self.folder)
+        with self.progress.stage("atlas") as stage:
+            atlas = build_atlas(self.scene, self.config.atlas.resolution, self.config.atlas.padding)
+            stage.facts |= {"texels": atlas.count, "texels_per_metre": round(atlas.texels_per_metre, 3)}
+        with self.progress.stage("points") as stage:
+            samples = self._samples(manifest, atlas)
+            stage.facts["samples"] = len(samples.position)
+        dataset = Dataset(self.folder, description, keep_alive)
+        self._direct(dataset, manifest, atlas, samples)
+        self._refuse_darkness(dataset)
+        self._indirect(dataset, manifest, atlas, effects, "train", dataset.split("train") + dataset.split("validation"))
+        self._indirect(dataset, manifest, atlas, effects, "test", dataset.split("test"))
+        return dataset
+
+    def _entries(self, given: Sequence[Lighting] | Splits | None) -> tuple[list[tuple[str, Lighting]], dict[str, int]]:
+        config = self.config.lightings
+        counts = {name: getattr(config, name) for name in store.SPLITS}
+        drawn: dict[str, int] = {}
+        if given is None and config.file:
+            listed = load_lightings(config.file)
+            if len(listed) < sum(counts.values()):
+                raise UserError(
+                    f"lightings.file {config.file}: got {len(listed)} lightings, expected {sum(counts.values())} "
+                    f"({', '.join(f'{name} {count}' for name, count in counts.items())}); lower lightings.train"
+                )
+            ends = np.cumsum(list(counts.values()))
+            given = {name: listed[end - counts[name] : end] for name, end in zip(counts, ends, strict=True)}
+        if given is None:
+            given = {}
+            for name, count in counts.items():
+                draw = draw_lightings(
+                    config,
+                    name,
+                    count,
+                    bounds=self.scene.bounds,
+                    clearance=self.tracer.clearance,
+                    seed=self.config.seed,
+                )
+                given[name] = draw.lightings
+                drawn["positions_tried"] = drawn.get("positions_tried", 0) + draw.candidates
+                drawn["positions_rejected"] = drawn.get("positions_rejected", 0) + draw.rejected
+        splits = given if isinstance(given, Mapping) else split_lightings(given)
+        for name in store.SPLITS:
+            if not splits.get(name):
+                raise UserError(f"lightings: got none for {name}, expected at least 1 each for train, validation and test")
+        return [(name, lighting) for name in store.SPLITS for lighting in splits[name]], drawn
+
+    def _warn_of_blocked(self, entries: Sequence[tuple[str, Lighting]]) -> None:
+        """Names lightings whose lamps all stand inside a solid or behind the walls."""
+        anchors = [(index, light.anchor()) for index, (_, lighting) in enumerate(entries) for light in lighting]
+        placed = [(index, anchor) for index, anchor in anchors if anchor is not None]
+        if not placed:
+            return
+        free = self.tracer.clearance(np.array([anchor for _, anchor in placed])) > 0
+        lit = {index for (index, _), ok in zip(placed, free, strict=True) if ok} | {i for i, a in anchors if a is None}
+        blocked = sorted({index for index, _ in placed} - lit)
+        if blocked:
+            names = ", ".join(f"{index} ({entries[index][0]})" for index in blocked[:8]) + (", ..." if len(blocked) > 8 else "")
+            self.progress.say(f"warning: {len(blocked)} lightings stand inside a solid or behind the walls: {names}")
+
+    def _description(self, entries: Sequence[tuple[str, Lighting]], effects: Plan, drawn: dict[str, int]) -> dict[str, Any]:
+        config = self.config
+        return {
+            "schema": store.SCHEMA,
+            "ddprt": __version__,
+            "scene": {"name": self.scene.name, "digest": self.scene.digest, "notes": list(self.scene.notes)},
+            "atlas": config.atlas.model_dump(),
+            "quantity": "irradiance",
+            "unit": "W/m2",
+            "seed": config.seed,
+            "points": {"count": config.points.count, "on": config.points.on, "file": config.points.file}
+            | {"supersample": config.points.supersample},
+            "transport": config.transport.model_dump(exclude={"threads"}) | {"integrator": self._integrator()},
+            "plan": [asdict(effect) for effect in effects.effects],
+            "drawn": drawn,
+            "lightings": [{"split": split, "lights": lighting_json(lighting)} for split, lighting in entries],
+        }
+
+    def _integrator(self) -> str:
+        return "operator" if self.config.transport.integrator == "auto" else self.config.transport.integrator
+
+    def _claim(self, description: dict[str, Any]) -> None:
+        """Writes dataset.json, or makes sure that what lies there is this very bake."""
+        if not (self.folder / "dataset.json").exists():
+            store.write_description(self.folder, description)
+            return
+        there = store.read_description(self.folder)
+        differs = [key for key in description if key != "ddprt" and there.get(key) != description[key]]
+        if differs:
+            name = there.get("scene", {}).get("name")
+            raise UserError(
+                f'{self.folder}: holds another dataset (scene "{name}"; {", ".join(differs)} differ); '
+                "choose another --out, or delete that folder"
+            )
+
+    def _samples(self, manifest: Manifest, atlas: Atlas) -> Samples:
+        config = self.config.points
+        if config.file:
+            samples = load_samples(config.file)
+            if len(samples.position) < config.count:
+                raise UserError(f"points.count: got {config.count}, but {config.file} has {len(samples.position)}")
+        else:
+            if config.count > atlas.count:
+                raise UserError(
+                    f'points.count: got {config.count}, but "{self.scene.name}" covers {atlas.count} texels; '
+                    "lower points.count or raise atlas.resolution"
+                )
+            samples = place_samples(self.scene, config.count * config.supersample, on=config.on, seed=self.config.seed)
+        if not manifest.holds("points.safetensors"):
+            tensors = {"position": samples.position, "normal": samples.normal, "albedo": samples.albedo}
+            store.write_tensors(self.folder / "points.safetensors", {**tensors, "spacing": np.array([samples.spacing])})
+            manifest.add("points.safetensors")
+        if not manifest.holds("scene.safetensors"):
+            store.write_tensors(self.folder / "scene.safetensors", {"corners": self.scene.corners})
+            manifest.add("scene.safetensors")
+        if not all(manifest.holds(f"atlas/{name}.exr") for name in ("position", "coverage")):
+            store.write_atlas(self.folder, atlas, manifest)
+        return samples
+
+    def _direct(self, dataset: Dataset, manifest: Manifest, atlas: Atlas, samples: Samples) -> None:
+        """Direct lightmaps and measured values, a lighting per task."""
+        todo = [i for i in range(len(dataset.lightings)) if not all(manifest.holds(map_name(k, i)) for k in ("direct", "measured"))]
+        count, seed = self.config.transport.direct_samples, self.config.seed
+        texels = np.repeat(np.arange(atlas.count), count)
+        grid = seeds.stream(seed, "texel positions").random((len(texels), 2), np.float32)
+        strata = (np.tile(np.arange(count, dtype=np.float32), atlas.count) + grid[:, 0]) / count
+        place, triangle = atlas.sampler.sample(texels, np.stack([np.minimum(strata, np.float32(1 - 1e-7)), grid[:, 1]], 1))
+        normals = self.tracer.normals[triangle]
+
+        def work(index: int) -> int:
+            lights = centred(self.tracer, dataset.lightings[index])
+            u = seeds.stream(seed, "direct", index).random((len(lights), len(texels), 2), np.float32)
+            light = direct_irradiance(self.tracer, lights, place, normals, u).reshape(atlas.count, count, 3).mean(1)
+            store.write_map(self.folder / map_name("direct", index), atlas.image(light))
+            measured = measure(self.tracer, dataset.lightings[index], samples.position, samples.normal, seed=seed, index=index)
+            store.write_tensors(self.folder / map_name("measured", index), {"irradiance": measured})
+            return index
+
+        with self.progress.stage("direct", len(todo)) as stage:
+            before = self.tracer.rays
+            for index in self.tracer.map(work, todo):
+                manifest.add(map_name("direct", index))
+                manifest.add(map_name("measured", index))
+                stage.advance()
+            stage.facts["rays"] = self.tracer.rays - before
+
+    def _refuse_darkness(self, dataset: Dataset) -> None:
+        brightness = np.array([store.read_map(self.folder / map_name("direct", i)).max() for i in range(len(dataset.lightings))])
+        dark = np.flatnonzero(brightness == 0)
+        if len(dark) == len(brightness):
+            raise UserError(
+                f"lightings: all {len(dark)} light nothing, expected light on the scene; "
+                "check their positions (inside a solid, outside the room) and intensities"
+            )
+        if len(dark):
+            names = ", ".join(f"{i} ({dataset.description['lightings'][i]['split']})" for i in dark[:8])
+            self.progress.say(
+                f"warning: {len(dark)} lightings light nothing: {names}{', ...' if len(dark) > 8 else ''}; their lamps stand "
+                "inside a solid, outside the room, point away or have no intensity"
+            )
+
+    def _indirect(self, dataset: Dataset, manifest: Manifest, atlas: Atlas, effects: Plan, split: str, indices: list[int]) -> None:
+        """Indirect lightmaps of a group of lightings that share gather rays: train with validation, or test."""
+        kinds = ["indirect", "noise"] if split == "test" else ["indirect"]
+        todo = [index for index in indices if not all(manifest.holds(map_name(kind, index)) for kind in kinds)]
+        if not todo:
+            return
+        halves = 2 if split == "test" else 1
+        with self.progress.stage(f"indirect {split}", halves * atlas.count) as stage:
+            before = self.tracer.rays
+            if self._integrator() == "reference":
+                light, noise = self._by_reference(dataset, atlas, effects, todo, halves, stage)
+            else:
+                light, noise = self._by_operator(dataset, atlas, effects, indices, split, halves, stage)
+                rows = [indices.index(index) for index in todo]
+                light, noise = light[rows], noise[rows] if halves == 2 else noise
+            for row, index in enumerate(todo):
+                for kind, values in zip(kinds, (light, noise), strict=False):
+                    store.write_map(self.folder / map_name(kind, index), atlas.image(values[row]))
+                    manifest.add(map_name(kind, index))
+            stage.facts["rays"] = self.tracer.rays - before
+
+    def _by_operator(
+        self, dataset: Dataset, atlas: Atlas, effects: Plan, indices: list[int], split: str, halves: int, stage: Any
+    ) -> tuple[np.ndarray, np.ndarray]:
+        direct = dataset.maps("direct", indices)
+        if effects.bounces == 0:
+            return np.zeros_like(direct), np.zeros_like(direct)
+        from ddprt.transport.operator import operator_indirect
+
+        config = self.config.transport
+        samples = config.test_samples if split == "test" else config.samples
+        resolution = config.sender_resolution or min(self.config.atlas.resolution, _SENDER_RESOLUTION)
+        results = [
+            operator_indirect(
+                self.tracer,
+                atlas,
+                direct,
+                samples=max(1, samples // halves),
+                sender_resolution=resolution,
+                seed=self.config.seed,
+                stream=f"{split} {half}",
+                bounces=effects.bounces,
+                advance=stage.advance,
+            )
+            for half in range(halves)
+        ]
+        first = results[0]
+        stage.facts |= {"bounces": first.bounces, "remainder": first.remainder, "senders": first.senders}
+        if halves == 1:
+            return first.indirect, np.zeros_like(direct)
+        return (first.indirect + results[1].indirect) / 2, (first.indirect - results[1].indirect) / 2
+
+    def _by_reference(
+        self, dataset: Dataset, atlas: Atlas, effects: Plan, todo: list[int], halves: int, stage: Any
+    ) -> tuple[np.ndarray, np.ndarray]:
+        from ddprt.transport.reference import on_texels, trace_reference
+
+        config = self.config.transport
+        samples = max(1, (config.test_samples if halves == 2 else config.samples) // halves)
+        maps = []
+        for index in todo:
+            parts = [
+                trace_reference(
+                    self.tracer,
+                    self.scene,
+                    dataset.lightings[index],
+                    on_texels(self.tracer, atlas, np.arange(atlas.count)),
+                    atlas.count,
+                    samples,
+                    seed=seeds.number(self.config.seed, "reference bake", index, half),
+                    bounces=effects.bounces,
+                ).indirect
+                for half in range(halves)
+            ]
+            maps.append([sum(parts) / halves, (parts[0] - parts[-1]) / 2])
+            stage.advance(halves * atlas.count // len(todo))
+        light = np.asarray(maps, np.float32)
+        return light[:, 0], light[:, 1]

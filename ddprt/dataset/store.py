@@ -1,0 +1,287 @@
+"""The dataset on disk: EXR pairs, a description, and a manifest that only names whole files.
+
+A file is written under a temporary name, synced and renamed; then its line (name, bytes, sha256) is appended to
+`manifest.jsonl`. What the manifest names is whole, what it does not name does not count: an interrupted bake goes on from there.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
+
+from ddprt.axes import Bool, Float32, Float64, Int
+from ddprt.errors import UserError
+from ddprt.files import make_folder, write_text, written_whole
+from ddprt.lights import Lighting, parse_lighting
+from ddprt.sampling.points import Samples
+from ddprt.scene.atlas import Atlas
+from ddprt.scene.exr import exposure_for, read_exr, write_exr
+
+SCHEMA = 1
+SPLITS = ("train", "validation", "test")
+_GBUFFER = ("position", "normal", "geometric_normal", "albedo", "area", "coverage")
+
+
+def map_name(kind: str, index: int) -> str:
+    """Relative path of a lighting's map; kind is "direct", "indirect", "noise" or "measured"."""
+    return f"{kind}/{index:06d}.{'safetensors' if kind == 'measured' else 'exr'}"
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A baked (or imported) dataset, read on demand; make one with `ddprt.bake` or `ddprt.open_dataset`.
+
+    Attributes:
+      folder: where it lies.
+      description: contents of dataset.json.
+      keep_alive: whatever must live as long as the dataset (a temporary folder).
+    """
+
+    folder: Path
+    description: dict[str, Any]
+    keep_alive: Any = field(default=None, repr=False, compare=False)
+
+    @cached_property
+    def lightings(self) -> tuple[Lighting, ...]:
+        """All lightings, by index."""
+        return tuple(parse_lighting(entry["lights"], f"lightings[{i}]") for i, entry in enumerate(self.description["lightings"]))
+
+    def split(self, name: str) -> list[int]:
+        """Indices of the lightings of "train", "validation" or "test"."""
+        return [index for index, entry in enumerate(self.description["lightings"]) if entry["split"] == name]
+
+    @property
+    def resolution(self) -> int:
+        """Texels per side."""
+        return int(self.description["atlas"]["resolution"])
+
+    @cached_property
+    def gbuffer(self) -> dict[str, Float32[np.ndarray, "texels channels"]]:
+        """Position, normal, geometric_normal, albedo, area and coverage of the covered texels."""
+        images = {name: read_exr(self.folder / "atlas" / f"{name}.exr")[0] for name in _GBUFFER}
+        covered = images["coverage"][..., 0] > 0
+        return {name: image[covered] for name, image in images.items()}
+
+    @cached_property
+    def covered(self) -> Bool[np.ndarray, "height width"]:
+        """Which texels carry light; arrays over texels run through them row by row."""
+        return read_exr(self.folder / "atlas" / "coverage.exr")[0][..., 0] > 0
+
+    @property
+    def area(self) -> Float64[np.ndarray, " texels"]:
+        """World area of the covered texels, m²."""
+        return self.gbuffer["area"][:, 0].astype(np.float64)
+
+    @cached_property
+    def samples(self) -> Samples:
+        """Where direct light was measured, all supersamples in progressive order."""
+        tensors = _read_tensors(self.folder / "points.safetensors")
+        return Samples(tensors["position"], tensors["normal"], tensors["albedo"], float(tensors["spacing"][0]))
+
+    @cached_property
+    def occluders(self) -> Float64[np.ndarray, "triangles 3 3"]:
+        """Triangle corners, metres: what casts shadows."""
+        return _read_tensors(self.folder / "scene.safetensors")["corners"]
+
+    def maps(self, kind: str, indices: Sequence[int]) -> Float32[np.ndarray, "lightings texels 3"]:
+        """Lightmaps of the covered texels in W/m²; kind is "direct", "indirect" or (held-out lightings) "noise"."""
+        values = np.empty((len(indices), int(self.covered.sum()), 3), np.float32)
+        for row, index in enumerate(indices):
+            values[row] = read_map(self.folder / map_name(kind, index))[self.covered]
+        return values
+
+    def measured(self, indices: Sequence[int]) -> Float32[np.ndarray, "lightings samples 3"]:
+        """Direct irradiance at all samples, W/m²."""
+        tensors = [_read_tensors(self.folder / map_name("measured", index)) for index in indices]
+        return np.stack([entry["irradiance"] for entry in tensors]) if tensors else np.empty((0, 0, 3), np.float32)
+
+    def values(self, indices: Sequence[int], points: int, quantity: str) -> Float32[np.ndarray, "lightings points 3"]:
+        """What an engine measures: supersamples averaged into the nearest of the first `points` samples.
+
+        Args:
+          indices: lightings.
+          points: how many; at most as many as there are samples.
+          quantity: "radiosity" (albedo times irradiance) or "irradiance", W/m².
+        """
+        return average_into_points(self.measured(indices), self.samples, points, quantity)
+
+
+def average_into_points(
+    irradiance: Float32[np.ndarray, "lightings samples 3"], samples: Samples, points: int, quantity: str
+) -> Float32[np.ndarray, "lightings points 3"]:
+    """Supersampled irradiance to one value per point; see `Dataset.values`."""
+    home = samples.nearest_point(points)
+    weighted = irradiance * samples.albedo.astype(np.float32) if quantity == "radiosity" else irradiance
+    total = np.zeros((len(irradiance), points, 3), np.float32)
+    np.add.at(total, (slice(None), home), weighted)
+    return total / np.bincount(home, minlength=points).astype(np.float32)[:, None]
+
+
+def open_dataset(folder: str | Path) -> Dataset:
+    """Opens a dataset folder.
+
+    Raises:
+      UserError: missing, damaged, of another schema, or not finished.
+    """
+    folder = Path(folder)
+    dataset = Dataset(folder, read_description(folder))
+    named = set(Manifest(folder).entries)
+    missing = [name for name in expected_files(dataset.description) if name not in named]
+    if missing:
+        raise UserError(
+            f"{folder}: got {len(missing)} files missing (first {missing[0]}), expected a finished bake; run the bake again to go on"
+        )
+    return dataset
+
+
+def read_description(folder: Path) -> dict[str, Any]:
+    """Contents of dataset.json.
+
+    Raises:
+      UserError: missing, not JSON, or another schema.
+    """
+    path = folder / "dataset.json"
+    try:
+        description = json.loads(path.read_text("utf-8"))
+        schema = description["schema"]
+    except OSError as error:
+        raise UserError(f"{path}: got {error.strerror or error}, expected a dataset; bake one first") from None
+    except (ValueError, KeyError, TypeError):
+        raise UserError(f"{path}: not a dataset description; delete the folder and bake again") from None
+    if schema != SCHEMA:
+        raise UserError(f"{path}: got schema {schema}, expected {SCHEMA}; bake again with this version")
+    return dict(description)
+
+
+def expected_files(description: dict[str, Any]) -> list[str]:
+    """Names of all files of a finished dataset."""
+    names = ["scene.safetensors", "points.safetensors", *(f"atlas/{name}.exr" for name in _GBUFFER)]
+    for index, entry in enumerate(description["lightings"]):
+        kinds = ["direct", "measured", "indirect", *(["noise"] if entry["split"] == "test" else [])]
+        names += [map_name(kind, index) for kind in kinds]
+    return names
+
+
+class Manifest:
+    """The list of whole files of a folder; appending is safe against being killed at any moment."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.path = folder / "manifest.jsonl"
+        self.entries: dict[str, dict[str, Any]] = {}
+        self._whole = 0
+        try:
+            raw = self.path.read_bytes()
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            raise UserError(f"{self.path}: cannot be read ({error.strerror or error}); mend the folder's permissions") from None
+        for line in raw.splitlines(keepends=True):
+            try:
+                entry = json.loads(line)
+                name = entry["file"]
+            except (ValueError, KeyError, TypeError):
+                break  # a line cut short by a kill: it and all after it do not count
+            if not line.endswith(b"\n"):
+                break
+            self.entries[name] = entry
+            self._whole += len(line)
+
+    def add(self, name: str) -> None:
+        """Names a file that has just been moved into place."""
+        path = self.folder / name
+        entry = {"file": name, "bytes": path.stat().st_size, "sha256": _sha256(path)}
+        line = (json.dumps(entry) + "\n").encode()
+        try:
+            with self.path.open("r+b" if self.path.exists() else "wb") as file:
+                file.truncate(self._whole)
+                file.seek(self._whole)
+                file.write(line)
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise UserError(f"{self.path}: cannot be written ({error.strerror or error}); free some space") from None
+        self._whole += len(line)
+        self.entries[name] = entry
+
+    def holds(self, name: str) -> bool:
+        """Whether a file is named and still there in its full length."""
+        entry = self.entries.get(name)
+        path = self.folder / name
+        return entry is not None and path.is_file() and path.stat().st_size == entry["bytes"]
+
+    def damaged(self) -> list[str]:
+        """One line for each named file that is missing or differs from its hash."""
+        faults = []
+        for name, entry in self.entries.items():
+            path = self.folder / name
+            if not path.is_file():
+                faults.append(f"{name}: missing")
+            elif path.stat().st_size != entry["bytes"]:
+                faults.append(f"{name}: got {path.stat().st_size} bytes, expected {entry['bytes']}")
+            elif _sha256(path) != entry["sha256"]:
+                faults.append(f"{name}: contents differ from their hash")
+        return faults
+
+
+def write_map(path: Path, image: Float32[np.ndarray, "height width 3"]) -> None:
+    """A lightmap as half floats under a power-of-two exposure: value = stored * 2**exposure."""
+    exposure = exposure_for(float(np.abs(image).max()))
+    attributes = {"ddprt_exposure": str(exposure), "ddprt_quantity": "irradiance", "ddprt_unit": "W/m2"}
+    write_exr(path, np.ldexp(image, -exposure), half=True, attributes=attributes)
+
+
+def read_map(path: Path) -> Float32[np.ndarray, "height width 3"]:
+    """The lightmap that `write_map` wrote, W/m².
+
+    Raises:
+      UserError: missing or damaged.
+    """
+    image, attributes = read_exr(path)
+    try:
+        return np.ldexp(image, int(attributes.get("ddprt_exposure", "0")))
+    except ValueError:
+        raise UserError(f"{path}: got exposure {attributes['ddprt_exposure']!r}, expected a whole number; bake it again") from None
+
+
+def write_atlas(folder: Path, atlas: Atlas, manifest: Manifest) -> None:
+    """The G-buffer as float EXRs, 0 where nothing is covered."""
+    for name in _GBUFFER:
+        values = np.asarray(getattr(atlas, name), np.float32)
+        image = atlas.image(values.reshape(atlas.count, -1))
+        write_exr(folder / "atlas" / f"{name}.exr", image)
+        manifest.add(f"atlas/{name}.exr")
+
+
+def write_tensors(path: Path, tensors: dict[str, np.ndarray]) -> None:
+    """Arrays as safetensors, whole or not at all."""
+    with written_whole(path) as temporary:
+        save_file({name: np.ascontiguousarray(array) for name, array in tensors.items()}, temporary)
+
+
+def write_description(folder: Path, description: dict[str, Any]) -> None:
+    """dataset.json, whole or not at all."""
+    make_folder(folder)
+    write_text(folder / "dataset.json", json.dumps(description, indent=1) + "\n")
+
+
+def _read_tensors(path: Path) -> dict[str, np.ndarray]:
+    try:
+        return load_file(path)
+    except (OSError, SafetensorError) as error:
+        raise UserError(f"{path}: not a whole tensor file ({error}); bake it again") from None
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+

@@ -1,0 +1,127 @@
+"""A Model: a Relighter with everything that an engine needs around it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ddprt.dataset.store import average_into_points
+from ddprt.errors import UserError
+from ddprt.fitting.encoding import Encoding
+from ddprt.lights import Light, Lighting, parse_lighting
+from ddprt.methods.method import Frame, Relighter
+from ddprt.sampling.points import Samples
+
+
+@dataclass(frozen=True)
+class Model:
+    """Relights a scene; make one with `ddprt.fit` or `ddprt.load_model`.
+
+    Attributes:
+      method: entry of `METHODS`.
+      relighter: what was learned.
+      encoding: scale and space of the light it sees.
+      samples: where to shade, all supersamples in progressive order.
+      points: how many values they are averaged into.
+      quantity: what is measured there, "radiosity" or "irradiance".
+      covered: which texels of the lightmap carry light.
+      area: of the covered texels, m².
+      occluders: triangle corners that cast shadows, metres.
+      scene: name and digest of what it was trained on.
+    """
+
+    method: str
+    relighter: Relighter
+    encoding: Encoding
+    samples: Samples
+    points: int
+    quantity: str
+    covered: np.ndarray
+    area: np.ndarray
+    occluders: np.ndarray
+    scene: dict[str, str]
+
+    def predict(self, values: Any, *, clamp: bool = True) -> np.ndarray:
+        """Indirect irradiance from measured light.
+
+        Args:
+          values: (points, 3) or (frames, points, 3) measured light in W/m², of `quantity`.
+          clamp: cut negative light off, as an engine does.
+        Returns:
+          (texels, 3) or (frames, texels, 3) float32, W/m², covered texels in row-major order.
+        Raises:
+          UserError: wrong shape, or not finite.
+        """
+        measured = np.asarray(values, np.float32)
+        single = measured.ndim == 2
+        if measured.shape[-2:] != (self.points, 3) or measured.ndim not in (2, 3):
+            raise UserError(f"values: got shape {measured.shape}, expected ({self.points}, 3) or (frames, {self.points}, 3)")
+        if not np.isfinite(measured).all():
+            raise UserError("values: got NaN or infinity, expected finite W/m²; check the shading of the measurement points")
+        frames = jnp.asarray(measured[None] if single else measured)
+        light = np.asarray(_relight(self.relighter, self.encoding, frames, *self._places, clamp=clamp))
+        return light[0] if single else light
+
+    def measure(self, lighting: Lighting | Light | Sequence[dict[str, Any]] | dict[str, Any]) -> np.ndarray:
+        """(points, 3) float32: direct light at the points with shadow rays, W/m², as `predict` takes it."""
+        from ddprt.transport.measure import measure
+
+        parsed = parse_lighting(lighting)
+        irradiance = measure(self._tracer, parsed, self.samples.position, self.samples.normal, seed=0)
+        return average_into_points(irradiance[None], self.samples, self.points, self.quantity)[0]
+
+    def relight(self, lighting: Lighting | Light | Sequence[dict[str, Any]] | dict[str, Any]) -> np.ndarray:
+        """Indirect lightmap of a lighting.
+
+        Args:
+          lighting: a light, several, or their JSON records.
+        Returns:
+          (height, width, 3) float32 irradiance in W/m², row 0 at the top, 0 where nothing is covered.
+        """
+        return self.image(self.predict(self.measure(lighting)))
+
+    def image(self, values: np.ndarray) -> np.ndarray:
+        """Values of covered texels as an image."""
+        image = np.zeros((*self.covered.shape, *values.shape[1:]), values.dtype)
+        image[self.covered] = values
+        return image
+
+    def save(self, folder: str | Path) -> None:
+        """Writes a self-contained folder: model.json and tensors.safetensors."""
+        from ddprt.runtime.model_file import save_model
+
+        save_model(self, Path(folder))
+
+    @cached_property
+    def _places(self) -> tuple[Array, Array]:
+        return (
+            jnp.asarray(self.samples.position[: self.points], jnp.float32),
+            jnp.asarray(self.samples.normal[: self.points], jnp.float32),
+        )
+
+    @cached_property
+    def _tracer(self) -> Any:
+        from ddprt.transport.embree import Tracer
+
+        return Tracer(self.occluders)
+
+
+@partial(jax.jit, static_argnames="clamp")
+def _relight(
+    relighter: Relighter,
+    encoding: Encoding,
+    values: Float[Array, "frames points 3"],
+    positions: Float[Array, "points 3"],
+    normals: Float[Array, "points 3"],
+    *,
+    clamp: bool,
+) -> Float[Array, "frames texels 3"]:
+    scale = encoding.scale(values)
+    frame = Frame(encoding.encode(values, scale), positions, normals)
+    return encoding.decode(relighter.predict(frame), scale, clamp=clamp)

@@ -1,0 +1,123 @@
+"""A model on disk: model.json and tensors.safetensors, self-contained, no pickle."""
+
+import json
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
+
+from ddprt import __version__
+from ddprt.errors import UserError
+from ddprt.files import write_text, written_whole
+from ddprt.fitting.encoding import Encoding
+from ddprt.methods import METHODS
+from ddprt.methods.method import FitReport
+from ddprt.runtime.model import Model
+from ddprt.sampling.points import Samples
+
+SCHEMA = 1
+
+
+def save_model(model: Model, folder: Path) -> None:
+    """Writes a model; what was there before stays whole until the new one is.
+
+    Raises:
+      UserError: the folder cannot be written.
+    """
+    tensors: dict[str, np.ndarray] = {
+        "points.position": model.samples.position,
+        "points.normal": model.samples.normal,
+        "points.albedo": model.samples.albedo,
+        "atlas.covered": model.covered,
+        "atlas.area": model.area,
+        "scene.corners": model.occluders,
+    }
+    static: dict[str, Any] = {}
+    for entry in fields(model.relighter):  # type: ignore[arg-type]
+        value = getattr(model.relighter, entry.name)
+        if entry.name == "report":
+            continue
+        if entry.metadata.get("static") or value is None:
+            static[entry.name] = value
+        elif isinstance(value, tuple):
+            static[entry.name] = {"tuple": len(value)}
+            tensors |= {f"relighter.{entry.name}.{i}": np.asarray(part) for i, part in enumerate(value)}
+        else:
+            tensors[f"relighter.{entry.name}"] = np.asarray(value)
+    document = {
+        "schema": SCHEMA,
+        "ddprt": __version__,
+        "method": model.method,
+        "encoding": asdict(model.encoding),
+        "points": {"count": model.points, "quantity": model.quantity, "spacing": model.samples.spacing},
+        "scene": model.scene,
+        "relighter": static,
+        "report": asdict(model.relighter.report),
+        "unit": "W/m2",
+    }
+    with written_whole(folder / "tensors.safetensors") as temporary:
+        save_file({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}, temporary)
+    write_text(folder / "model.json", json.dumps(document, indent=1) + "\n")
+
+
+def load_model(folder: str | Path) -> Model:
+    """Reads a model; neither its dataset nor its scene file is needed.
+
+    Raises:
+      UserError: missing, damaged, of another schema, or of a method that is not installed.
+    """
+    folder = Path(folder)
+    try:
+        document = json.loads((folder / "model.json").read_text("utf-8"))
+        schema = document["schema"]
+    except OSError as error:
+        raise UserError(f"{folder}: got {error.strerror or error}, expected a model folder; fit one first") from None
+    except (ValueError, KeyError, TypeError):
+        raise UserError(f"{folder / 'model.json'}: not a model description; fit it again") from None
+    if schema != SCHEMA:
+        raise UserError(f"{folder}: got model schema {schema}, expected {SCHEMA}; fit it again with this version")
+    try:
+        tensors = load_file(folder / "tensors.safetensors")
+    except (OSError, SafetensorError) as error:
+        raise UserError(f"{folder / 'tensors.safetensors'}: not a whole tensor file ({error}); fit it again") from None
+    relighter_type = METHODS[document["method"]].relighter
+    try:
+        return _assemble(document, tensors, relighter_type)
+    except (KeyError, TypeError) as error:
+        raise UserError(f"{folder}: model.json and tensors.safetensors do not fit together ({error}); fit it again") from None
+
+
+def _assemble(document: dict[str, Any], tensors: dict[str, np.ndarray], relighter_type: type) -> Model:
+    arguments: dict[str, Any] = {}
+    for entry in fields(relighter_type):
+        static = document["relighter"].get(entry.name)
+        if entry.name == "report":
+            arguments["report"] = FitReport(**{key: _tuples(value) for key, value in document["report"].items()})
+        elif isinstance(static, dict):
+            arguments[entry.name] = tuple(jnp.asarray(tensors[f"relighter.{entry.name}.{i}"]) for i in range(static["tuple"]))
+        elif entry.name in document["relighter"]:
+            arguments[entry.name] = static
+        else:
+            arguments[entry.name] = jnp.asarray(tensors[f"relighter.{entry.name}"])
+    places = document["points"]
+    samples = Samples(tensors["points.position"], tensors["points.normal"], tensors["points.albedo"], places["spacing"])
+    return Model(
+        document["method"],
+        relighter_type(**arguments),
+        Encoding(**document["encoding"]),
+        samples,
+        places["count"],
+        places["quantity"],
+        tensors["atlas.covered"],
+        tensors["atlas.area"],
+        tensors["scene.corners"],
+        document["scene"],
+    )
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value

@@ -1,0 +1,124 @@
+"""From a dataset to a Model."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ddprt import seeds
+from ddprt.config import Config, FitConfig
+from ddprt.dataset.store import Dataset
+from ddprt.errors import UserError
+from ddprt.fitting.encoding import Encoding
+from ddprt.methods import make_method
+from ddprt.methods.method import Examples, Frame
+from ddprt.runtime.model import Model
+
+
+def fit(
+    data: Dataset,
+    method: str = "svd-ridge",
+    *,
+    bases: int = 16,
+    ridge: float | str | tuple[float, ...] = "auto",
+    space: str = "linear",
+    gamma: float = 2.2,
+    centre: str = "none",
+    channels: str = "mono",
+    weights: str = "area",
+    points: int | None = None,
+    quantity: str = "radiosity",
+    settings: Mapping[str, Any] | None = None,
+    seed: int = 0,
+) -> Model:
+    """Learns a model from a dataset's train split.
+
+    Args:
+      data: from `ddprt.bake` or `ddprt.open_dataset`.
+      method: entry of `METHODS`.
+      bases: basis vectors, the mean counted in where there is one.
+      ridge: "auto" (leave-one-out), a number in units of scaled measured², or one number per measurement.
+      space: "linear" or "gamma", with exponent `gamma`.
+      centre: "none" keeps relighting linear, "mean" is the paper's.
+      channels: "mono" or "multi".
+      weights: "area" or "texel".
+      points: measurement points to use; None takes as many as were baked.
+      quantity: "radiosity" or "irradiance" at the points.
+      settings: the method's own.
+      seed: of learned methods.
+    Raises:
+      UserError: unknown names, values out of range, or more points than the dataset has.
+    """
+    from ddprt.config import load_config
+
+    shared = {"method": method, "bases": bases, "ridge": ridge, "space": space, "gamma": gamma}
+    shared |= {"centre": centre, "channels": channels, "weights": weights}
+    overrides = {f"fit.{key}": _text(value) for key, value in shared.items()}
+    config = load_config(None, overrides).fit
+    return fit_method(data, config, method, settings or {}, points=points, quantity=quantity, seed=seed)
+
+
+def fit_method(
+    data: Dataset,
+    config: FitConfig,
+    name: str,
+    settings: Mapping[str, Any],
+    *,
+    points: int | None,
+    quantity: str,
+    seed: int,
+) -> Model:
+    """The same from a [fit] section; `name` overrides its method."""
+    method = make_method(name, config.model_dump(exclude={"method"}), settings)
+    points = data.description["points"]["count"] if points is None else points
+    if points > len(data.samples.position):
+        raise UserError(f"points: got {points}, but the dataset has {len(data.samples.position)} samples; bake with more")
+    encoding = Encoding(config.space, config.gamma, config.channels)
+    train, validation = (examples(data, split, encoding, config, points, quantity) for split in ("train", "validation"))
+    relighter = method.fit(train, validation, key=jax.random.key(seeds.number(seed, f"method {name}")))
+    return Model(
+        name,
+        relighter,
+        encoding,
+        data.samples,
+        points,
+        quantity,
+        data.covered,
+        data.area,
+        data.occluders,
+        {key: data.description["scene"][key] for key in ("name", "digest")},
+    )
+
+
+def examples(data: Dataset, split: str, encoding: Encoding, config: FitConfig, points: int, quantity: str) -> Examples:
+    """Scaled and encoded pairs of a split: here arrays pass from NumPy to JAX."""
+    indices = data.split(split)
+    values = jnp.asarray(data.values(indices, points, quantity))
+    scale = encoding.scale(values)
+    frame = Frame(
+        encoding.encode(values, scale),
+        jnp.asarray(data.samples.position[:points], jnp.float32),
+        jnp.asarray(data.samples.normal[:points], jnp.float32),
+        [data.lightings[index] for index in indices],
+    )
+    indirect = encoding.encode(jnp.asarray(data.maps("indirect", indices)), scale)
+    return Examples(frame, indirect, scale, np.asarray(data.area, np.float32), config.weights, config.channels)
+
+
+def fit_config(data: Dataset, config: Config, name: str) -> Model:
+    """Fits one entry of the comparison as a configuration says."""
+    return fit_method(
+        data,
+        config.fit,
+        name,
+        config.methods.settings.get(name, {}),
+        points=min(config.points.count, len(data.samples.position)),
+        quantity=config.points.quantity,
+        seed=config.seed,
+    )
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else str(list(value)) if isinstance(value, tuple) else repr(value)

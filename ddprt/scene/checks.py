@@ -1,0 +1,206 @@
+"""The one door through which raw arrays become a `Scene`.
+
+What cannot be mended is refused by name; what can be is mended and noted, one line each. Winding is made consistent but
+a body is never turned inside out: a room is seen from inside, and only its maker knows.
+"""
+
+import numpy as np
+
+from ddprt.axes import Float, Int
+from ddprt.errors import UserError
+from ddprt.scene.mesh import Material, Scene
+from ddprt.scene.winding import repeats, welded, winding
+
+UNSAID = 0.8
+"""Albedo where a file names none: that of a matt white wall."""
+
+NEGLIGIBLE = 1e-8
+"""Triangles lower than this share of the bounding box's diagonal vanish in the tracer's float32."""
+
+FARTHEST = 1e15
+"""Metres; beyond it squares of lengths leave float32."""
+
+
+def checked(
+    name: str,
+    positions: np.ndarray,
+    triangles: np.ndarray,
+    *,
+    normals: np.ndarray | None = None,
+    material: np.ndarray | None = None,
+    materials: tuple[Material, ...] = (Material("plain", (UNSAID,) * 3),),
+    uv: np.ndarray | None = None,
+    notes: tuple[str, ...] = (),
+) -> Scene:
+    """Check raw arrays, mend what can be mended and make a `Scene` of them.
+
+    Args:
+      name: for messages.
+      positions: (vertices, 3), metres, Y up.
+      triangles: (triangles, 3) corner indices, counter-clockwise seen from the free space.
+      normals: (vertices, 3) of any length; missing, zero or non-finite ones are made from the faces at the vertex.
+      material: index into `materials` per triangle; all 0 if left out.
+      materials: albedo and texture, each 0 to 1, linear.
+      uv: (vertices, 2) texture coordinates, origin top-left; needed where a material has a texture.
+      notes: what an importer has to say already.
+    Returns:
+      The scene; `notes` lists the repairs after those given.
+    Raises:
+      UserError: nothing there, a wrong shape, an index out of range, vertices that are not finite, impossible albedo.
+    """
+    positions = np.ascontiguousarray(_table(name, "positions", positions, 3), dtype=np.float64)
+    triangles = np.array(_table(name, "triangles", triangles, 3))
+    if not len(triangles):
+        raise UserError(f"{name}: got no triangles, expected at least one; export a triangle mesh")
+    _in_range(name, "corner", triangles, len(positions))
+    _finite(name, "position", positions, triangles)
+    material = np.zeros(len(triangles), np.int32) if material is None else np.asarray(material)
+    if material.shape != (len(triangles),):
+        raise UserError(
+            f"{name}: got materials of shape {material.shape}, expected one index for each of {len(triangles)} triangles"
+        )
+    _in_range(name, "material", material, len(materials))
+    for entry in materials:
+        _reflects(name, entry, uv)
+    if uv is not None:
+        uv = np.asarray(_table(name, "uv", uv, 2, len(positions)), dtype=np.float64)
+        _finite(name, "texture coordinate", uv, triangles)
+
+    found = list(notes)
+    triangles = triangles.astype(np.int64)
+    weld = welded(positions)
+    keep = ~_negligible(positions[triangles])
+    if removed := np.count_nonzero(~keep):
+        found.append(f"{removed} triangles of no area removed")
+    repeated, opposed = repeats(weld[triangles], keep)
+    if repeated.any():
+        back = f", {opposed} of them the back of another: give a sheet thickness if both sides reflect" if opposed else ""
+        found.append(f"{np.count_nonzero(repeated)} repeated triangles removed{back}")
+    keep &= ~repeated
+    if not keep.any():
+        raise UserError(
+            f"{name}: got only triangles of no area, expected a surface; check the unit and the scale of the export"
+        )
+    triangles, material = triangles[keep], material[keep]
+
+    turned, twisted = winding(weld[triangles], _areas(positions[triangles]))
+    if turned.any():
+        found.append(f"{np.count_nonzero(turned)} triangles turned to face as the rest of their surface")
+        triangles[turned] = triangles[turned, ::-1]
+    if twisted:
+        found.append(f"{twisted} surfaces have one side only (like a Moebius strip): winding left as it was")
+
+    used, triangles = np.unique(triangles, return_inverse=True)
+    triangles = triangles.reshape(-1, 3)
+    if dropped := len(positions) - len(used):
+        found.append(f"{dropped} vertices of no triangle dropped")
+    positions, uv = positions[used], None if uv is None else uv[used]
+    given = None if normals is None else np.asarray(_table(name, "normals", normals, 3, len(weld)), dtype=np.float64)[used]
+    unit, remark = _shading(positions, triangles, given)
+    return Scene(
+        name,
+        positions,
+        triangles.astype(np.int32),
+        unit,
+        np.ascontiguousarray(material, dtype=np.int32),
+        tuple(materials),
+        uv,
+        (*found, *remark),
+    )
+
+
+def vertex_normals(
+    positions: Float[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "triangles 3"]
+) -> Float[np.ndarray, "vertices 3"]:
+    """Unit normals per vertex: those of the faces there, weighted by their angle at the vertex.
+
+    The angle makes the result independent of how a flat face is cut into triangles. Where the faces cancel out, one of
+    their normals is taken. Every vertex must belong to a triangle of some area.
+    """
+    corners = positions[triangles]
+    after, before = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
+    cross = np.cross(after[:, 0], before[:, 0])
+    length = np.linalg.norm(cross, axis=1, keepdims=True)
+    face = cross / length
+    angle = np.arctan2(length, np.einsum("tcd,tcd->tc", after, before))
+    total = np.stack(
+        [np.bincount(triangles.ravel(), (angle * face[:, axis, None]).ravel(), len(positions)) for axis in range(3)], axis=1
+    )
+    some = np.empty_like(positions)
+    some[triangles] = face[:, None]
+    size = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.where(size > 1e-9, total / np.maximum(size, 1e-9), some)
+
+
+def _table(name: str, what: str, rows: np.ndarray, columns: int, length: int | None = None) -> np.ndarray:
+    rows = np.asarray(rows)
+    expected = f"({'n' if length is None else length}, {columns})"
+    if rows.ndim != 2 or rows.shape[1] != columns or (length is not None and len(rows) != length):
+        raise UserError(f"{name}: got {what} of shape {rows.shape}, expected {expected}; pass one row each")
+    return rows
+
+
+def _in_range(name: str, what: str, index: np.ndarray, count: int) -> None:
+    if index.dtype.kind not in "iu":
+        raise UserError(f"{name}: got {what} indices of type {index.dtype}, expected integers; convert them")
+    outside = (index < 0) | (index >= count)
+    if outside.any():
+        raise UserError(
+            f"{name}: got {what} index {index[outside][0]} ({np.count_nonzero(outside)} out of range),"
+            f" expected 0 to {count - 1}; the file is damaged or cut short"
+        )
+
+
+def _finite(name: str, what: str, rows: np.ndarray, triangles: np.ndarray) -> None:
+    bad = ~(np.abs(rows) < FARTHEST).all(axis=1)
+    at_fault = np.unique(triangles[bad[triangles]])
+    if len(at_fault):
+        raise UserError(
+            f"{name}: got {len(at_fault)} vertices whose {what} is not finite, the first at index {at_fault[0]},"
+            " expected numbers; remove them and export again"
+        )
+
+
+def _reflects(name: str, material: Material, uv: np.ndarray | None) -> None:
+    albedo = np.asarray(material.albedo, dtype=np.float64)
+    if albedo.shape != (3,) or not ((albedo >= 0) & (albedo <= 1)).all():
+        raise UserError(
+            f'{name}: got albedo {material.albedo} of material "{material.name}", expected three numbers 0 to 1; correct it'
+        )
+    if (texture := material.texture) is None:
+        return
+    if texture.ndim != 3 or texture.shape[2] != 3 or not texture.size or not ((texture >= 0) & (texture <= 1)).all():
+        raise UserError(
+            f'{name}: got a texture of material "{material.name}" that is not (height, width, 3) with values 0 to 1; correct it'
+        )
+    if uv is None:
+        raise UserError(
+            f'{name}: got a texture of material "{material.name}" but no texture coordinates; unwrap it or drop the texture'
+        )
+
+
+def _areas(corners: np.ndarray) -> np.ndarray:
+    return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+
+
+def _negligible(corners: np.ndarray) -> np.ndarray:
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    diagonal = np.linalg.norm(np.ptp(corners.reshape(-1, 3), axis=0))
+    return 2 * _areas(corners) <= NEGLIGIBLE * diagonal * longest
+
+
+def _shading(
+    positions: np.ndarray, triangles: np.ndarray, given: np.ndarray | None
+) -> tuple[Float[np.ndarray, "vertices 3"], list[str]]:
+    made = vertex_normals(positions, triangles)
+    if given is None:
+        return made, ["shading normals made from the faces"]
+    finite = (np.abs(given) < FARTHEST).all(axis=1, keepdims=True)
+    length = np.linalg.norm(np.where(finite, given, 0.0), axis=1, keepdims=True)
+    good = length > 1e-12
+    unit = np.where(good, given / np.where(good, length, 1.0), made)
+    behind = np.count_nonzero(np.einsum("vd,vd->v", unit, made) < 0)
+    remark = [f"{np.count_nonzero(~good)} missing shading normals made from the faces"] if not good.all() else []
+    if behind:
+        remark.append(f"{behind} shading normals point behind their faces: left as they are; check the winding")
+    return unit, remark

@@ -1,0 +1,248 @@
+"""glTF 2.0 in (.glb, .gltf): triangles, base colours and base textures; all else is named once and ignored.
+
+Base colour factors are linear and base textures sRGB, as the standard says, and their product is taken as diffuse albedo,
+whatever the metalness. A primitive without normals is flat.
+"""
+
+import warnings
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pygltflib
+from scipy.spatial.transform import Rotation
+
+from ddprt.axes import Float, Float64, Int
+from ddprt.errors import UserError
+from ddprt.scene.accessors import Container, open_gltf
+from ddprt.scene.checks import UNSAID, checked
+from ddprt.scene.images import linear_image
+from ddprt.scene.mesh import Material, Scene
+
+REFUSED = {
+    "KHR_draco_mesh_compression": "export without Draco compression",
+    "EXT_meshopt_compression": "export without meshopt compression",
+    "KHR_meshopt_compression": "export without meshopt compression",
+    "EXT_mesh_gpu_instancing": "export instances as nodes",
+    "KHR_texture_basisu": "export textures as PNG or JPEG",
+}
+"""Extensions whose absence would lose geometry or textures, and the way out."""
+
+UNDERSTOOD = ("KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp")
+HARMLESS = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "KHR_animation", "KHR_node_visibility")
+"""May be required by a file and are still only ignored."""
+
+
+def load_gltf(path: Path) -> Scene:
+    """Read a glTF file's default scene into one mesh in world space.
+
+    Args:
+      path: a .glb, or a .gltf with its buffers and images embedded or beside it.
+    Returns:
+      The scene: metres, fronts as in the file (mirrored nodes keep theirs), one material per glTF material.
+    Raises:
+      UserError: damaged or cut short, not glTF 2.0, compressed geometry, sparse accessors, strips or fans.
+    Reference: Khronos glTF 2.0 specification; KHR_mesh_quantization, KHR_texture_transform.
+    """
+    try:
+        with warnings.catch_warnings():
+            # pygltflib speaks by warnings; what matters in them is found and refused below.
+            warnings.simplefilter("ignore")
+            return _Reader(open_gltf(path)).scene()
+    except UserError:
+        raise
+    except Exception as problem:
+        reason = f"{type(problem).__name__}: {problem}".splitlines()[0]
+        raise UserError(f"{path.name}: got a damaged file ({reason}), expected glTF 2.0; export it again") from problem
+
+
+@dataclass
+class _Part:
+    """One primitive in world space."""
+
+    positions: Float[np.ndarray, "vertices 3"]
+    normals: Float[np.ndarray, "vertices 3"]
+    uv: Float[np.ndarray, "vertices 2"]
+    triangles: Int[np.ndarray, "triangles 3"]
+    material: int
+
+
+@dataclass
+class _Reader:
+    file: Container
+    ignored: set[str] = field(default_factory=set)
+    notes: list[str] = field(default_factory=list)
+    images: dict[int, np.ndarray] = field(default_factory=dict)
+
+    def scene(self) -> Scene:
+        self._extensions()
+        parts = [part for mesh, world in self._placed() for part in self._parts(mesh, world)]
+        if not parts:
+            raise self.file.fault("got no triangles, expected a mesh in the file's scene; export at least one")
+        starts = np.cumsum([0, *[len(part.positions) for part in parts]])
+        numbers = sorted({part.material for part in parts})
+        materials = tuple(self._material(number) for number in numbers)
+        self.ignored.update(
+            what for what, there in (("animations", self.file.json.animations), ("skins", self.file.json.skins)) if there
+        )
+        listed = [f"ignored in the file: {', '.join(sorted(self.ignored))}"] if self.ignored else []
+        return checked(
+            self.file.path.stem,
+            np.concatenate([part.positions for part in parts]),
+            np.concatenate([part.triangles + start for part, start in zip(parts, starts, strict=False)]),
+            normals=np.concatenate([part.normals for part in parts]),
+            material=np.concatenate([np.full(len(part.triangles), numbers.index(part.material)) for part in parts]),
+            materials=materials,
+            uv=np.concatenate([part.uv for part in parts]) if any(entry.texture is not None for entry in materials) else None,
+            notes=(*self.notes, *listed),
+        )
+
+    def _extensions(self) -> None:
+        required, used = set(self.file.json.extensionsRequired or []), set(self.file.json.extensionsUsed or [])
+        for name in sorted(required | used):
+            if name in REFUSED:
+                raise self.file.fault(f"got {name}, which is not read; {REFUSED[name]}")
+            if name in required and name not in UNDERSTOOD and not name.startswith(HARMLESS):
+                raise self.file.fault(f"got the required extension {name}, which is not read; export without it")
+        self.ignored.update(used - set(UNDERSTOOD))
+
+    def _placed(self) -> list[tuple[int, Float64[np.ndarray, "4 4"]]]:
+        """Meshes with their transforms to the world, in the order of the hierarchy."""
+        nodes, scenes = self.file.json.nodes, self.file.json.scenes
+        children = {child for node in nodes for child in node.children or []}
+        roots = scenes[self.file.json.scene or 0].nodes if scenes else [n for n in range(len(nodes)) if n not in children]
+        placed, seen, waiting = [], set(), [(root, np.eye(4)) for root in reversed(roots)]
+        while waiting:
+            number, parent = waiting.pop()
+            if number in seen or number < 0:
+                raise self.file.fault(f"got node {number} twice in the hierarchy, expected a tree; export it again")
+            seen.add(number)
+            node = nodes[number]
+            world = parent @ _transform(node)
+            if node.mesh is not None:
+                placed.append((node.mesh, world))
+            waiting += [(child, world) for child in reversed(node.children or [])]
+        return placed
+
+    def _parts(self, mesh: int, world: Float64[np.ndarray, "4 4"]) -> list[_Part]:
+        parts = []
+        for primitive in self.file.json.meshes[mesh].primitives:
+            mode = 4 if primitive.mode is None else primitive.mode
+            if mode in (0, 1, 2, 3):
+                self.ignored.add("points and lines")
+                continue
+            if mode != 4:
+                raise self.file.fault(f"got a triangle strip or fan (mode {mode}), expected triangle lists; triangulate it")
+            parts.append(self._part(primitive, world))
+        return parts
+
+    def _part(self, primitive: Any, world: Float64[np.ndarray, "4 4"]) -> _Part:
+        attributes = primitive.attributes
+        positions = self.file.accessor(attributes.POSITION, 3)
+        count = len(positions)
+        index = (
+            np.arange(count) if primitive.indices is None else self.file.accessor(primitive.indices, 1)[:, 0].astype(np.int64)
+        )
+        triangles = index[: len(index) // 3 * 3].reshape(-1, 3)
+        if triangles.size and triangles.max() >= count:
+            raise self.file.fault(f"got vertex index {triangles.max()}, expected 0 to {count - 1}; export it again")
+        flat = attributes.NORMAL is None
+        normals = np.full((count, 3), np.nan) if flat else self.file.accessor(attributes.NORMAL, 3)
+        uv = self._coordinates(primitive, count)
+        if primitive.targets:
+            self.ignored.add("morph targets")
+        if getattr(attributes, "COLOR_0", None) is not None:
+            self.ignored.add("vertex colours")
+        linear = world[:3, :3]
+        mirrored = np.linalg.det(linear) < 0
+        # The cofactors are the inverse transpose up to a factor, and exist where the inverse does not.
+        cofactors = np.cross(np.roll(linear, -1, axis=0), np.roll(linear, -2, axis=0)) * (-1 if mirrored else 1)
+        if flat:
+            corner = triangles.ravel()
+            positions, normals, uv, triangles = (
+                positions[corner],
+                normals[corner],
+                uv[corner],
+                np.arange(corner.size).reshape(-1, 3),
+            )
+        return _Part(
+            positions @ linear.T + world[:3, 3],
+            normals @ cofactors.T,
+            uv,
+            triangles[:, ::-1] if mirrored else triangles,
+            -1 if primitive.material is None else primitive.material,
+        )
+
+    def _coordinates(self, primitive: Any, count: int) -> Float[np.ndarray, "vertices 2"]:
+        texture = None if primitive.material is None else _base(self.file.json.materials[primitive.material]).baseColorTexture
+        if texture is None:
+            return np.zeros((count, 2))
+        change = (texture.extensions or {}).get("KHR_texture_transform", {})
+        name = f"TEXCOORD_{change.get('texCoord', texture.texCoord or 0)}"
+        accessor = getattr(primitive.attributes, name, None)
+        if accessor is None:
+            raise self.file.fault(
+                f"got a base texture but no {name}, expected texture coordinates; unwrap it or drop the texture"
+            )
+        angle = change.get("rotation", 0.0)
+        # As every viewer does; the listing in the extension's text has the sign the other way round (glTF issue 1563).
+        turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        return self.file.accessor(accessor, 2) * change.get("scale", [1.0, 1.0]) @ turn.T + change.get("offset", [0.0, 0.0])
+
+    def _material(self, number: int) -> Material:
+        if number < 0:
+            self.notes.append(f"no material on some triangles: albedo {UNSAID} assumed")
+            return Material("none", (UNSAID,) * 3)
+        entry = self.file.json.materials[number]
+        base = _base(entry)
+        self.ignored.update(
+            what
+            for what, there in (
+                ("emissive", any(entry.emissiveFactor or []) or entry.emissiveTexture),
+                ("alpha", (entry.alphaMode or "OPAQUE") != "OPAQUE"),
+                ("double-sided (back faces absorb)", entry.doubleSided),
+                ("metallic and roughness", base.metallicFactor or base.metallicRoughnessTexture),
+                ("normal maps", entry.normalTexture),
+                ("occlusion maps", entry.occlusionTexture),
+            )
+            if there
+        )
+        red, green, blue = (float(value) for value in (base.baseColorFactor or [1.0] * 4)[:3])
+        texture = None if base.baseColorTexture is None else self._image(base.baseColorTexture.index)
+        return Material(entry.name or f"material {number}", (red, green, blue), texture)
+
+    def _image(self, number: int) -> np.ndarray:
+        texture = self.file.json.textures[number]
+        webp = (texture.extensions or {}).get("EXT_texture_webp", {}).get("source")
+        source = webp if webp is not None else texture.source
+        if source is None:
+            raise self.file.fault(f"got texture {number} without an image, expected PNG or JPEG; export textures as PNG")
+        if texture.sampler is not None:
+            sampler = self.file.json.samplers[texture.sampler]
+            if {sampler.wrapS, sampler.wrapT} - {None, 10497}:
+                self.ignored.add("texture wrap modes other than repeat")
+        if source in self.images:
+            return self.images[source]
+        image = self.file.json.images[source]
+        try:
+            self.images[source] = linear_image(
+                bytes(self.file.view(image.bufferView)) if image.uri is None else self.file.uri(image.uri)
+            )
+        except OSError as problem:
+            raise self.file.fault(f"got image {source} that cannot be read ({problem}); export textures as PNG") from problem
+        return self.images[source]
+
+
+def _base(material: Any) -> Any:
+    return material.pbrMetallicRoughness or pygltflib.PbrMetallicRoughness(metallicFactor=0.0)
+
+
+def _transform(node: Any) -> Float64[np.ndarray, "4 4"]:
+    """A node's matrix; glTF stores matrices by columns and applies scale, then rotation, then translation."""
+    if node.matrix is not None:
+        return np.array(node.matrix, dtype=np.float64).reshape(4, 4).T
+    local = np.eye(4)
+    local[:3, :3] = Rotation.from_quat(node.rotation or [0.0, 0.0, 0.0, 1.0]).as_matrix() * (node.scale or [1.0, 1.0, 1.0])
+    local[:3, 3] = node.translation or [0.0, 0.0, 0.0]
+    return local

@@ -1,0 +1,76 @@
+"""Which way triangles face, by what they share: vertices at one place, edges, all three corners.
+
+In go corners named by place (see `welded`), out come masks over triangles; nothing here knows inside from outside.
+"""
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from ddprt.axes import Bool, Float, Int
+
+
+def welded(positions: Float[np.ndarray, "vertices 3"]) -> Int[np.ndarray, " vertices"]:
+    """A number per vertex, the same for vertices at exactly the same place."""
+    order = np.lexsort(positions.T)
+    fresh = (np.diff(positions[order], axis=0) != 0).any(axis=1)
+    number = np.empty(len(positions), np.int64)
+    number[order] = np.concatenate([[0], np.cumsum(fresh)])
+    return number
+
+
+def repeats(
+    corners: Int[np.ndarray, "triangles 3"], keep: Bool[np.ndarray, " triangles"]
+) -> tuple[Bool[np.ndarray, " triangles"], int]:
+    """Triangles that repeat an earlier one.
+
+    Args:
+      corners: place of each corner.
+      keep: which triangles count at all.
+    Returns:
+      Mask of those whose three places an earlier triangle has, and how many of them face the other way.
+    """
+    rank = np.argsort(corners, axis=1)
+    odd = (rank[:, 0] - rank[:, 1]) % 3 == 1
+    places = np.take_along_axis(corners, rank, axis=1)
+    order = np.lexsort([*places.T, ~keep])
+    equal = (np.diff(places[order], axis=0) == 0).all(axis=1) & keep[order[1:]] & keep[order[:-1]]
+    group = np.concatenate([[0], np.cumsum(~equal)])
+    first = order[np.searchsorted(group, group)]
+    repeated = np.zeros(len(corners), bool)
+    repeated[order] = first != order
+    return repeated, int(np.count_nonzero(odd[first] != odd[order]))
+
+
+def winding(
+    corners: Int[np.ndarray, "triangles 3"], areas: Float[np.ndarray, " triangles"]
+) -> tuple[Bool[np.ndarray, " triangles"], int]:
+    """Triangles to turn so that neighbours over an edge of exactly two agree.
+
+    Each triangle stands twice in a graph, as it is and turned; an edge joins the two states that agree. An orientable
+    surface then falls into two components, its two windings, of which the one with more area as it is wins (the first
+    triangle's, at a tie); a one-sided surface is a single component.
+
+    Args:
+      corners: place of each corner, no two of a triangle the same.
+      areas: of the triangles, any unit.
+    Returns:
+      Mask of triangles to turn, never more than half of a surface's area, and the number of one-sided surfaces.
+    """
+    count = len(corners)
+    start, end = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
+    edge = np.minimum(start, end) * (corners.max() + 1) + np.maximum(start, end)
+    order = np.argsort(edge, kind="stable")
+    equal = np.concatenate([[False], np.diff(edge[order]) == 0, [False]])
+    pair = equal[1:-1] & ~equal[:-2] & ~equal[2:]
+    one, other = order[:-1][pair], order[1:][pair]
+    clash = start[one] == start[other]
+    a, b = one // 3, other // 3
+    rows, columns = np.concatenate([a, a + count]), np.concatenate([b + count * clash, b + count * ~clash])
+    graph = coo_array((np.ones(len(rows), bool), (rows, columns)), shape=(2 * count, 2 * count))
+    label, mirror = connected_components(graph, directed=False)[1].reshape(2, count)
+    surface, turned = np.minimum(label, mirror), label > mirror
+    majority = np.bincount(surface, areas * np.where(turned, 1, -1)) > 1e-9 * np.bincount(surface, areas)
+    # Where the two labels are one, nothing is `turned` and so nothing is a majority: such surfaces stay as they are.
+    one_sided = label == mirror
+    return turned ^ majority[surface], len(np.unique(surface[one_sided]))
