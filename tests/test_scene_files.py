@@ -1,0 +1,536 @@
+"""Files in: glTF written here byte by byte, OBJ, PLY and STL; what they say arrives, what is damaged is a UserError."""
+
+import base64
+import io
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pygltflib
+import pytest
+from PIL import Image
+
+from ddprt.errors import UserError
+from ddprt.scene.files import load_scene
+from ddprt.scene.images import linear_image, srgb_to_linear
+from ddprt.scene.shapes import icosphere
+
+TRIANGLE = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+FACING = np.array([[0.0, 0, 1]] * 3)
+PICTURE = np.array([[[255, 0, 0], [0, 255, 0], [0, 0, 255]], [[0, 0, 0], [188, 188, 188], [255, 255, 255]]], np.uint8)
+
+
+def png() -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(PICTURE).save(stream, "PNG")
+    return stream.getvalue()
+
+
+class Writer:
+    """A glTF document in the making; attributes are appended to one buffer."""
+
+    def __init__(self) -> None:
+        self.json: dict = {"asset": {"version": "2.0"}, "scenes": [{"nodes": []}]}
+        self.json |= {name: [] for name in ("accessors", "bufferViews", "meshes", "nodes")}
+        self.data = b""
+
+    def view(self, data: bytes, **more: int) -> int:
+        self.data += b"\0" * (-len(self.data) % 4)
+        self.json["bufferViews"].append({"buffer": 0, "byteOffset": len(self.data), "byteLength": len(data), **more})
+        self.data += data
+        return len(self.json["bufferViews"]) - 1
+
+    def accessor(self, rows: np.ndarray, kind: str = "<f4", **more: object) -> int:
+        rows = np.asarray(rows).astype(kind)
+        width = {1: "SCALAR", 2: "VEC2", 3: "VEC3"}[1 if rows.ndim == 1 else rows.shape[1]]
+        code = {"|i1": 5120, "|u1": 5121, "<i2": 5122, "<u2": 5123, "<u4": 5125, "<f4": 5126}[rows.dtype.str]
+        entry = {"bufferView": self.view(rows.tobytes()), "componentType": code, "count": len(rows), "type": width}
+        self.json["accessors"].append({**entry, **more})
+        return len(self.json["accessors"]) - 1
+
+    def mesh(
+        self, *, normals: bool = True, indices: str | None = "<u2", positions: np.ndarray = TRIANGLE, **primitive: object
+    ) -> int:
+        attributes = {"POSITION": self.accessor(positions), **dict(primitive.pop("attributes", {}))}  # type: ignore[call-overload]
+        if normals:
+            attributes["NORMAL"] = self.accessor(FACING)
+        if indices:
+            primitive["indices"] = self.accessor(np.arange(len(positions)), indices)
+        self.json["meshes"].append({"primitives": [{"attributes": attributes, **primitive}]})
+        return len(self.json["meshes"]) - 1
+
+    def node(self, *, root: bool = True, **node: object) -> int:
+        self.json["nodes"].append(node)
+        if root:
+            self.json["scenes"][0]["nodes"].append(len(self.json["nodes"]) - 1)
+        return len(self.json["nodes"]) - 1
+
+    def glb(self, path: Path) -> Path:
+        document = pygltflib.GLTF2.from_dict({**self.json, "buffers": [{"byteLength": len(self.data)}]})
+        document.set_binary_blob(self.data)
+        document.save_binary(str(path))
+        return path
+
+    def gltf(self, path: Path, uri: str | None = None) -> Path:
+        uri = uri or "data:application/octet-stream;base64," + base64.b64encode(self.data).decode()
+        path.write_text(json.dumps({**self.json, "buffers": [{"byteLength": len(self.data), "uri": uri}]}))
+        return path
+
+
+pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning:dataclasses_json")
+
+
+def one(**mesh: object) -> Writer:
+    writer = Writer()
+    writer.node(mesh=writer.mesh(**mesh))  # type: ignore[arg-type]
+    return writer
+
+
+@pytest.mark.parametrize("indices", ["|u1", "<u2", "<u4", None])
+def test_index_types(tmp_path: Path, indices: str | None) -> None:
+    scene = load_scene(one(indices=indices).glb(tmp_path / "one.glb"))
+    assert scene.name == "one"
+    np.testing.assert_array_equal(scene.positions, TRIANGLE)
+    np.testing.assert_array_equal(scene.triangles, [[0, 1, 2]])
+    np.testing.assert_array_equal(scene.normals, FACING)
+
+
+def test_hierarchy_of_transforms_and_instances(tmp_path: Path) -> None:
+    writer = Writer()
+    mesh = writer.mesh()
+    half = np.sqrt(0.5)
+    child = writer.node(root=False, mesh=mesh, translation=[0, 0, 2], rotation=[0, half, 0, half], scale=[1, 2, 3])
+    writer.node(children=[child], translation=[10, 0, 0])
+    matrix = np.array([[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]], float)
+    writer.node(mesh=mesh, matrix=matrix.T.ravel().tolist())
+    scene = load_scene(writer.glb(tmp_path / "tree.glb"))
+    # A quarter turn about y takes x to -z; then two along z; then ten along x.
+    np.testing.assert_allclose(scene.corners[0], [[10, 0, 2], [10, 0, 1], [10, 2, 2]], atol=1e-12)
+    np.testing.assert_allclose(scene.normals[:3], [[1, 0, 0]] * 3, atol=1e-12)
+    np.testing.assert_allclose(scene.corners[1], [[5, 6, 7], [5, 7, 7], [4, 6, 7]], atol=1e-12)
+    assert len(scene.materials) == 1
+
+
+def test_normals_follow_the_inverse_transpose(tmp_path: Path) -> None:
+    slope = np.array([[0.0, 0, 0], [1, 0, -1], [0, 1, 0]])
+    writer = one(positions=slope, normals=False)
+    writer.json["nodes"][0]["scale"] = [1, 1, 3]
+    writer.json["meshes"][0]["primitives"][0]["attributes"]["NORMAL"] = writer.accessor(
+        np.array([[1.0, 0, 1]] * 3) / np.sqrt(2)
+    )
+    scene = load_scene(writer.glb(tmp_path / "slope.glb"))
+    np.testing.assert_allclose(scene.normals, np.repeat(scene.geometric_normals, 3, axis=0), atol=1e-6)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_mirrored_bodies_keep_their_outside(tmp_path: Path, mirrored: bool) -> None:
+    points, triangles = icosphere(1)
+    writer = Writer()
+    index, normal = writer.accessor(triangles.ravel(), "|u1"), writer.accessor(points)
+    writer.json["meshes"] = [{"primitives": [{"attributes": {"POSITION": normal, "NORMAL": normal}, "indices": index}]}]
+    writer.node(mesh=0, scale=[-2, 1, 1] if mirrored else [2, 1, 1], translation=[1, 2, 3])
+    scene = load_scene(writer.glb(tmp_path / "ball.glb"))
+    outward = scene.corners.mean(1) - [1, 2, 3]
+    assert (np.einsum("td,td->t", outward, scene.geometric_normals) > 0).all()
+    assert (np.einsum("vd,vd->v", scene.positions - [1, 2, 3], scene.normals) > 0).all()
+    assert scene.notes == ("no material on some triangles: albedo 0.8 assumed",)
+
+
+def test_without_normals_a_primitive_is_flat(tmp_path: Path) -> None:
+    writer = one(normals=False, positions=np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]), indices=None)
+    writer.json["meshes"][0]["primitives"][0]["indices"] = writer.accessor(np.array([0, 2, 1, 0, 1, 3]), "|u1")
+    scene = load_scene(writer.glb(tmp_path / "fold.glb"))
+    np.testing.assert_allclose(scene.normals, [[0, 0, -1]] * 3 + [[0, -1, 0]] * 3, atol=1e-12)
+    assert any("6 missing shading normals" in note for note in scene.notes)
+
+
+def test_colour_factor_keeps_its_precision_and_materials_stay_apart(tmp_path: Path) -> None:
+    writer = Writer()
+    factor = [0.123456789, 0.5000001, 0.98765432, 1]
+    writer.json["materials"] = [
+        {"name": "paint", "pbrMetallicRoughness": {"baseColorFactor": factor, "metallicFactor": 0}},
+        {"name": "unsaid"},
+    ]
+    for material in (1, 0, 0):
+        writer.node(mesh=writer.mesh(material=material), translation=[0, 0, len(writer.json["nodes"])])
+    scene = load_scene(writer.glb(tmp_path / "paint.glb"))
+    assert [entry.name for entry in scene.materials] == ["paint", "unsaid"]
+    assert scene.materials[0].albedo == tuple(factor[:3])
+    assert scene.materials[1].albedo == (1.0, 1.0, 1.0)
+    assert scene.material.tolist() == [1, 0, 0]
+    assert scene.uv is None
+
+
+def textured(**texture: object) -> Writer:
+    writer = Writer()
+    uv = writer.accessor(np.array([[0.5 / 3, 0.25], [2.5 / 3, 0.25], [0.5 / 3, 0.75]]))
+    writer.node(mesh=writer.mesh(attributes={"TEXCOORD_0": uv}, material=0))
+    writer.json["materials"] = [
+        {
+            "name": "print",
+            "pbrMetallicRoughness": {"baseColorFactor": [0.5, 1, 1, 1], "baseColorTexture": {"index": 0, **texture}},
+        }
+    ]
+    writer.json["textures"] = [{"source": 0}]
+    return writer
+
+
+CORNERS = ([1.0, 0, 0], [0.0, 1, 0], [0.0, 0, 1])
+SHOWN = np.array([[0.5, 0, 0], [0, 0, 1], [0, 0, 0]])
+"""Corners of the textured triangle look at the picture's first, third and fourth pixel."""
+
+
+@pytest.mark.parametrize("place", ["view", "uri", "file"])
+def test_texture_is_the_right_way_up(tmp_path: Path, place: str) -> None:
+    writer = textured()
+    if place == "view":
+        writer.json["images"] = [{"bufferView": writer.view(png()), "mimeType": "image/png"}]
+    elif place == "uri":
+        writer.json["images"] = [{"uri": "data:image/png;base64," + base64.b64encode(png()).decode()}]
+    else:
+        (tmp_path / "the picture.png").write_bytes(png())
+        writer.json["images"] = [{"uri": "the%20picture.png"}]
+    scene = load_scene(writer.gltf(tmp_path / "print.gltf"))
+    np.testing.assert_allclose(scene.albedo_at(np.zeros(3, int), np.array(CORNERS)), SHOWN, atol=1e-6)
+
+
+def test_texture_transform_turns_scales_and_shifts(tmp_path: Path) -> None:
+    change = {"offset": [0.25, 0.5], "rotation": np.pi / 2, "scale": [2.0, 4.0]}
+    writer = textured(extensions={"KHR_texture_transform": change})
+    writer.json["extensionsRequired"] = writer.json["extensionsUsed"] = ["KHR_texture_transform"]
+    writer.json["images"] = [{"bufferView": writer.view(png())}]
+    scene = load_scene(writer.glb(tmp_path / "print.glb"))
+    # Where v points down, a counter-clockwise quarter turn takes u to -v and v to u.
+    np.testing.assert_allclose(scene.uv, [[0.25 + 1, 0.5 - 1 / 3], [0.25 + 1, 0.5 - 5 / 3], [0.25 + 3, 0.5 - 1 / 3]], atol=1e-6)
+    assert not any("texture_transform" in note for note in scene.notes)
+
+
+def test_strides_normalised_integers_and_two_texture_sets(tmp_path: Path) -> None:
+    writer = textured(texCoord=1)
+    writer.json["images"] = [{"bufferView": writer.view(png())}]
+    mixed = np.zeros(3, [("position", "<f4", 3), ("uv", "<u2", 2), ("rest", "<u4")])
+    mixed["position"], mixed["uv"], mixed["rest"] = TRIANGLE, [[0, 65535], [65535, 0], [32768, 0]], 0xFFFFFFFF
+    view = writer.view(mixed.tobytes(), byteStride=20)
+    writer.json["accessors"] += [
+        {"bufferView": view, "componentType": 5126, "count": 3, "type": "VEC3"},
+        {"bufferView": view, "byteOffset": 12, "componentType": 5123, "normalized": True, "count": 3, "type": "VEC2"},
+    ]
+    attributes = writer.json["meshes"][0]["primitives"][0]["attributes"]
+    attributes.update({"POSITION": len(writer.json["accessors"]) - 2, "TEXCOORD_1": len(writer.json["accessors"]) - 1})
+    attributes["NORMAL"] = writer.accessor(np.array([[0, 0, 127]] * 3), "|i1", normalized=True)
+    scene = load_scene(writer.glb(tmp_path / "mixed.glb"))
+    np.testing.assert_array_equal(scene.positions, TRIANGLE)
+    np.testing.assert_allclose(scene.uv, [[0, 1], [1, 0], [32768 / 65535, 0]])
+    np.testing.assert_array_equal(scene.normals, FACING)
+
+
+def test_what_is_ignored_is_listed_once(tmp_path: Path) -> None:
+    writer = one(material=0)
+    writer.mesh(mode=1)
+    writer.node(mesh=1)
+    writer.json["materials"] = [
+        {"emissiveFactor": [1, 0, 0], "alphaMode": "BLEND", "doubleSided": True, "pbrMetallicRoughness": {}}
+    ]
+    writer.json["extensionsUsed"] = ["KHR_lights_punctual"]
+    scene = load_scene(writer.glb(tmp_path / "much.glb"))
+    (note,) = scene.notes
+    for word in ("KHR_lights_punctual", "alpha", "double-sided", "emissive", "metallic", "points and lines"):
+        assert note.count(word) == 1
+
+
+def spoil(writer: Writer, **entries: object) -> Writer:
+    writer.json.update(entries)
+    return writer
+
+
+@pytest.mark.parametrize(
+    ("writer", "says"),
+    [
+        (lambda: spoil(one(), extensionsUsed=["KHR_draco_mesh_compression"]), "KHR_draco_mesh_compression.*without Draco"),
+        (lambda: spoil(one(), extensionsRequired=["EXT_meshopt_compression"]), "EXT_meshopt_compression"),
+        (lambda: spoil(one(), extensionsRequired=["XYZ_unheard_of"]), "required extension XYZ_unheard_of"),
+        (lambda: one(mode=5), "triangle strip or fan"),
+        (lambda: one(mode=1), "no triangles"),
+        (lambda: spoil(one(), meshes=[]), "damaged"),
+        (lambda: spoil(one(), scenes=[{"nodes": [7]}]), "damaged"),
+        (lambda: spoil(one(), nodes=[{"children": [0], "mesh": 0}]), "twice in the hierarchy"),
+        (
+            lambda: spoil(one(), accessors=[{"componentType": 5126, "count": 3, "type": "VEC3", "sparse": {"count": 1}}] * 3),
+            "sparse",
+        ),
+        (lambda: spoil(one(), accessors=[{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC2"}] * 3), "VEC2"),
+        (
+            lambda: spoil(one(), accessors=[{"bufferView": 0, "componentType": 5126, "count": 9**9, "type": "VEC3"}] * 3),
+            "damaged",
+        ),
+        (lambda: spoil(one(), bufferViews=[{"buffer": 0, "byteOffset": 0, "byteLength": 10**6}] * 3), "cut short"),
+        (lambda: spoil(textured(), images=[{"uri": "nowhere.png"}]), 'no "nowhere.png" beside it'),
+        (lambda: spoil(textured(), images=[{"uri": "data:image/png;base64,AAAA"}]), "image 0 that cannot be read"),
+        (lambda: spoil(textured(texCoord=1), images=[{"uri": "x"}]), "no TEXCOORD_1"),
+        (lambda: spoil(one(material=0), materials=[{"pbrMetallicRoughness": {"baseColorFactor": [2, 0, 0, 1]}}]), "0 to 1"),
+    ],
+)
+def test_refused_gltf(tmp_path: Path, writer: object, says: str) -> None:
+    with pytest.raises(UserError, match=says) as caught:
+        load_scene(writer().gltf(tmp_path / "bad.gltf"))  # type: ignore[operator]
+    assert str(caught.value).startswith("bad")
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_buffer_file(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r'no "gone\.bin" beside it'):
+        load_scene(one().gltf(tmp_path / "bad.gltf", "gone.bin"))
+
+
+OBJ = """mtllib room.mtl
+o floor
+v 0 0 0
+v 0 0 1
+v 1 0 1
+v 1 0 0
+vt 0.1666667 0.75
+vt 0.8333333 0.75
+vt 0.1666667 0.25
+vt 0.5 0.5
+usemtl print
+f 1/1 2/2 3/3
+f 1/1 3/3 4/4
+o wall
+v 0 1 0
+v 1 1 0
+usemtl red
+f 1 4 6 5
+"""
+MTL = "newmtl print\nKd 0.5 1 1\nmap_Kd print.png\nnewmtl red\nKd 0.1234567 0.25 0.5\nKe 1 0 0\nd 1.0\n"
+
+
+def write_obj(folder: Path) -> Path:
+    (folder / "room.mtl").write_text(MTL)
+    (folder / "print.png").write_bytes(png())
+    (folder / "room.obj").write_text(OBJ)
+    return folder / "room.obj"
+
+
+def test_obj_with_materials_and_texture(tmp_path: Path) -> None:
+    scene = load_scene(str(write_obj(tmp_path)))
+    assert scene.areas.sum() == pytest.approx(2)
+    names = [entry.name for entry in scene.materials]
+    assert sorted(names) == ["print", "red"]
+    assert scene.materials[names.index("red")].albedo == (0.1234567, 0.25, 0.5)
+    wall = scene.material == names.index("red")
+    np.testing.assert_allclose(scene.geometric_normals[wall], [[0, 0, 1]] * 2)
+    np.testing.assert_allclose(scene.geometric_normals[~wall], [[0, 1, 0]] * 2)
+    np.testing.assert_allclose(scene.normals[scene.triangles].mean(1), scene.geometric_normals, atol=1e-12)
+    corners = {(0, 0): SHOWN[0], (0, 1): SHOWN[1], (1, 1): SHOWN[2]}
+    first = np.flatnonzero(~wall)[(scene.corners[~wall] == [0, 0, 1]).all(2).any(1)]
+    albedo = scene.albedo_at(np.repeat(first, 3), np.array(CORNERS))
+    for corner, seen in zip(scene.corners[first[0]], albedo, strict=True):
+        np.testing.assert_allclose(seen, corners[corner[0], corner[2]], atol=1e-5)
+    assert 'ignored in material "red": ke' in scene.notes
+
+
+def test_obj_says_which_files_are_missing(tmp_path: Path) -> None:
+    path = write_obj(tmp_path)
+    (tmp_path / "print.png").unlink()
+    assert any("print.png" in note for note in load_scene(path).notes)
+    (tmp_path / "room.mtl").unlink()
+    scene = load_scene(path)
+    assert "room.mtl is missing: its materials are unknown" in scene.notes
+    assert {entry.albedo for entry in scene.materials} == {(0.8, 0.8, 0.8)}
+
+
+def test_obj_colours_count_only_where_no_material_speaks(tmp_path: Path) -> None:
+    mesh = "v 0 0 0 1 0 0\nv 1 0 0 1 0 0\nv 0 1 0 1 0 0\n{}f 1 2 3\n"
+    (tmp_path / "a.obj").write_text(mesh.format(""))
+    assert load_scene(tmp_path / "a.obj").materials[0].albedo == (1.0, 0.0, 0.0)
+    (tmp_path / "room.mtl").write_text(MTL)
+    (tmp_path / "a.obj").write_text("mtllib room.mtl\n" + mesh.format("usemtl red\n"))
+    assert load_scene(tmp_path / "a.obj").materials[0].albedo == (0.1234567, 0.25, 0.5)
+
+
+def test_obj_groups_without_materials_stay_apart_and_normals_are_kept(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvn 0 0.6 0.8\no one\nf 1//1 2//1 3//1\no two\nf 1//1 3//1 4//1\n"
+    )
+    scene = load_scene(tmp_path / "a.obj")
+    assert sorted(entry.name for entry in scene.materials) == ["one", "two"]
+    assert len(set(scene.material.tolist())) == 2
+    np.testing.assert_allclose(scene.normals, [[0, 0.6, 0.8]] * len(scene.normals))
+
+
+PLY = """ply
+format ascii 1.0
+element vertex 4
+property float x
+property float y
+property float z
+{vertex}element face 2
+property list uchar int vertex_indices
+{face}end_header
+0 0 0{a}
+1 0 0{a}
+1 1 0{a}
+0 1 0{b}
+3 0 1 2{c}
+3 0 2 3{d}
+"""
+COLOUR = "property uchar red\nproperty uchar green\nproperty uchar blue\n"
+GREY = float(srgb_to_linear(np.array(128 / 255.0)))
+
+
+@pytest.mark.parametrize(
+    ("fields", "albedo", "noted"),
+    [
+        ({}, [[0.8] * 3] * 2, True),
+        ({"face": COLOUR, "c": " 255 0 128", "d": " 0 255 0"}, [[1, 0, GREY], [0, 1, 0]], False),
+        ({"vertex": COLOUR, "a": " 255 0 128", "b": " 0 255 128"}, [[1, 0, GREY], [2 / 3, 1 / 3, GREY]], False),
+    ],
+)
+def test_ply_colours(tmp_path: Path, fields: dict[str, str], albedo: list, noted: bool) -> None:
+    (tmp_path / "a.ply").write_text(PLY.format(**{key: fields.get(key, "") for key in ("vertex", "face", "a", "b", "c", "d")}))
+    scene = load_scene(tmp_path / "a.ply")
+    np.testing.assert_allclose(scene.albedo_at(np.arange(2), np.full((2, 3), 1 / 3)), albedo, atol=1e-12)
+    assert any("albedo 0.8 assumed" in note for note in scene.notes) == noted
+
+
+def test_ply_quads_keep_their_colours_and_their_side(tmp_path: Path) -> None:
+    text = PLY.format(vertex="", face=COLOUR, a="", b="", c="", d="")
+    head = text[: text.index("3 0 1 2")].replace("element vertex 4", "element vertex 6")
+    (tmp_path / "a.ply").write_text(head + "0 2 0\n1 2 0\n4 0 1 2 3 255 0 0\n4 3 2 5 4 0 255 0\n")
+    scene = load_scene(tmp_path / "a.ply")
+    assert not any("turned" in note for note in scene.notes)
+    np.testing.assert_allclose(scene.geometric_normals, [[0, 0, 1]] * 4)
+    albedo = scene.albedo_at(np.arange(4), np.full((4, 3), 1 / 3))
+    np.testing.assert_allclose(albedo[:, 0], scene.corners[..., 1].max(axis=1) <= 1)
+    assert scene.areas.sum() == pytest.approx(2)
+
+
+def test_ply_says_that_its_texture_is_missing(tmp_path: Path) -> None:
+    text = PLY.format(**dict.fromkeys(("vertex", "face", "a", "b", "c", "d"), ""))
+    (tmp_path / "a.ply").write_text(text.replace("ascii 1.0\n", "ascii 1.0\ncomment TextureFile gone.png\n"))
+    assert "texture gone.png is missing" in load_scene(tmp_path / "a.ply").notes
+
+
+def test_many_vertex_colours_are_rounded(tmp_path: Path) -> None:
+    import trimesh
+
+    points, triangles = icosphere(5)
+    colours = ((points + 1) * 127.5).astype(np.uint8)
+    trimesh.Trimesh(points, triangles, vertex_colors=colours, process=False).export(tmp_path / "ball.ply")
+    scene = load_scene(tmp_path / "ball.ply")
+    assert 100 < len(scene.materials) <= 4096
+    assert any("32 levels" in note for note in scene.notes)
+    expected = srgb_to_linear(colours[triangles] / 255.0).mean(1)
+    seen = scene.albedo_at(np.arange(len(triangles)), np.full((len(triangles), 3), 1 / 3))
+    assert np.abs(np.sqrt(seen) - np.sqrt(expected)).max() <= 0.51 / 31
+
+
+@pytest.mark.parametrize("suffix", ["ply", "obj", "stl"])
+def test_round_trip_of_a_ball(tmp_path: Path, suffix: str) -> None:
+    import trimesh
+
+    points, triangles = icosphere(2)
+    trimesh.Trimesh(points, triangles, process=False).export(tmp_path / f"ball.{suffix}")
+    scene = load_scene(tmp_path / f"ball.{suffix}")
+    np.testing.assert_allclose(scene.corners, points[triangles], atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(scene.normals, axis=1), 1)
+
+
+def binary_ply(path: Path) -> Path:
+    import trimesh
+
+    trimesh.Trimesh(*icosphere(1), process=False).export(path)
+    return path
+
+
+def complaint(path: Path) -> str:
+    """What `load_scene` has against the file, empty if nothing; any other exception passes through."""
+    try:
+        load_scene(path)
+    except UserError as problem:
+        return str(problem)
+    return ""
+
+
+@pytest.mark.parametrize("kind", ["glb", "gltf", "obj", "ply", "stl"])
+def test_cut_files_raise_nothing_but_user_errors(tmp_path: Path, kind: str) -> None:
+    if kind in ("glb", "gltf"):
+        writer = textured()
+        writer.json["images"] = [{"bufferView": writer.view(png())}]
+        whole = getattr(writer, kind)(tmp_path / f"whole.{kind}").read_bytes()
+    elif kind == "obj":
+        whole = write_obj(tmp_path).read_bytes()
+    else:
+        whole = binary_ply(tmp_path / f"whole.{kind}").read_bytes()
+    refused = 0
+    cuts = sorted({0, 1, 3, 4, 11, 12, 20, 83, 84, *range(30, len(whole), max(1, len(whole) // 60)), len(whole) - 1})
+    for cut in cuts:
+        path = tmp_path / f"cut.{kind}"
+        path.write_bytes(whole[:cut])
+        said = complaint(path)
+        refused += bool(said)
+        assert "\n" not in said
+    # A text file that ends early after a whole line may still be a mesh.
+    assert refused == len(cuts) if kind in ("glb", "gltf", "ply", "stl") else refused > 5
+
+
+@pytest.mark.parametrize("kind", ["glb", "ply", "stl", "obj"])
+def test_scrambled_files_raise_nothing_but_user_errors(tmp_path: Path, kind: str) -> None:
+    generator = np.random.default_rng(3)
+    if kind == "glb":
+        whole = one().glb(tmp_path / "whole.glb").read_bytes()
+    else:
+        whole = write_obj(tmp_path).read_bytes() if kind == "obj" else binary_ply(tmp_path / f"whole.{kind}").read_bytes()
+    for _ in range(60):
+        data = np.frombuffer(whole, np.uint8).copy()
+        where = generator.integers(0, len(data), 4)
+        data[where] = generator.integers(0, 256, 4)
+        path = tmp_path / f"noise.{kind}"
+        path.write_bytes(data.tobytes())
+        assert "\n" not in complaint(path)
+
+
+def test_glb_header_is_held_against_the_length(tmp_path: Path) -> None:
+    path = one().glb(tmp_path / "a.glb")
+    data = bytearray(path.read_bytes())
+    data[8:12] = struct.pack("<I", len(data) + 100)
+    path.write_bytes(bytes(data))
+    with pytest.raises(UserError, match=f"got {len(data)} bytes, expected {len(data) + 100}"):
+        load_scene(path)
+
+
+@pytest.mark.parametrize(
+    ("source", "parameters", "says"),
+    [
+        ("cornel", {}, 'did you mean "cornell".*known: convex, .*or a path that ends in .glb'),
+        ("room.fbx", {}, 'suffix ".fbx", expected .glb'),
+        ("some/where", {}, 'suffix ""'),
+        ("nowhere/room.glb", {}, "no such file"),
+        ("room.obj", {}, "no such file"),
+        (Path("cornell"), {}, 'suffix ""'),
+        ("furnace", {"albdeo": 1.0}, 'did you mean "albedo"'),
+    ],
+)
+def test_sources_that_are_not_there(source: str | Path, parameters: dict[str, float], says: str) -> None:
+    with pytest.raises(UserError, match=says):
+        load_scene(source, **parameters)
+
+
+def test_load_scene_takes_library_names_with_parameters_and_files_without(tmp_path: Path) -> None:
+    assert load_scene("furnace", albedo=0.25, subdivisions=1).materials[0].albedo == (0.25,) * 3
+    path = one().glb(tmp_path / "ROOM.GLB")
+    assert load_scene(path).name == "ROOM"
+    with pytest.raises(UserError, match="got parameter albedo, expected none for a file"):
+        load_scene(path, albedo=0.5)
+    with pytest.raises(UserError, match="no such file"):
+        load_scene(tmp_path / "folder.glb")
+
+
+def test_pictures_become_linear() -> None:
+    linear = linear_image(png())
+    assert linear.dtype == np.float32
+    np.testing.assert_allclose(linear[0], np.eye(3), atol=1e-7)
+    np.testing.assert_allclose(linear[1], [[0] * 3, [0.502886] * 3, [1] * 3], atol=1e-5)
+    deep = linear_image(Image.fromarray(np.array([[0, 32768, 65535]], np.uint16)))
+    np.testing.assert_allclose(deep[0, :, 0], [0, 0.21404, 1], atol=1e-4)
