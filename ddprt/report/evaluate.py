@@ -1,0 +1,212 @@
+"""Everything a report says, as data: scores, floors, curves and the check against the reference integrator."""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ddprt import seeds
+from ddprt.config import Config
+from ddprt.dataset.store import Dataset
+from ddprt.fitting.basis import entry_weights
+from ddprt.report.metrics import Truth, negative_share, z_scores
+from ddprt.runtime.model import Model
+from ddprt.runtime.train import fit_method
+from ddprt.scene.mesh import Scene
+
+_REPEATS = 5
+
+
+@dataclass
+class Evaluation:
+    """What was found on the held-out lightings.
+
+    Attributes:
+      metrics: contents of metrics.json.
+      truth: the held-out maps.
+      values: measured at the points, per held-out lighting.
+      predicted: clamped predictions per method.
+      curve: error against number of bases, rows of (bases, transfer, projection).
+      spot_check: z-scores against the reference integrator, and the values behind them; empty where it was skipped.
+      distance: metres from each held-out lighting's nearest lamp to the nearest surface; NaN for distant lights.
+    """
+
+    metrics: dict[str, Any]
+    truth: Truth
+    values: np.ndarray
+    predicted: dict[str, np.ndarray]
+    curve: list[tuple[int, float, float]] = field(default_factory=list)
+    spot_check: dict[str, Any] = field(default_factory=dict)
+    distance: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+
+def evaluate(data: Dataset, models: Mapping[str, Model], fit_seconds: Mapping[str, float]) -> Evaluation:
+    """Scores models on a dataset's test split.
+
+    Args:
+      data: the dataset.
+      models: by name of their method.
+      fit_seconds: how long each took to fit; 0 where unknown.
+    """
+    test = data.split("test")
+    truth = Truth(data.maps("indirect", test), data.area)
+    predicted, scores, values = {}, {}, np.zeros((0, 0, 3))
+    for name, model in models.items():
+        values = data.values(test, model.points, model.quantity)
+        unclamped = model.predict(values, clamp=False)
+        predicted[name] = model.predict(values)
+        report = model.relighter.report
+        scores[name] = {
+            **truth.scores(predicted[name]),
+            "negative_share": negative_share(unclamped, truth.weight),
+            "fit_seconds": fit_seconds.get(name, 0.0),
+            "relight_seconds": _relight_seconds(model, values),
+            "bytes": model.relighter.nbytes,
+            "flops": model.relighter.flops,
+            "bases": report.bases,
+            "status": report.status,
+        }
+    _judge_by_mean(scores)
+    main = next(iter(models.values()))
+    report = main.relighter.report
+    metrics = {
+        "schema": 1,
+        "scene": data.description["scene"]["name"],
+        "texels": int(data.covered.sum()),
+        "lightings": {split: len(data.split(split)) for split in ("train", "validation", "test")},
+        "dark_test_lightings": int((truth.squares == 0).sum()),
+        "methods": scores,
+        "floors": {
+            "noise_relative_rmse": truth.relative_rmse(data.maps("noise", test)),
+            "projection_relative_rmse": projection_error(data, main, truth),
+            "mean_relative_rmse": scores.get("mean", {}).get("relative_rmse"),
+        },
+        "numerics": {
+            "measurement_condition": [_finite(value) for value in report.condition],
+            "numerical_rank": report.numerical_rank,
+            "ridge": list(report.ridge),
+            "ridge_chosen_by": report.ridge_chosen_by,
+        },
+    }
+    evaluation = Evaluation(metrics, truth, values, predicted)
+    evaluation.distance = _distance_to_surface(data, main, test)
+    return evaluation
+
+
+def projection_error(data: Dataset, model: Model, truth: Truth, bases: int | None = None) -> float | None:
+    """Error of the best possible coefficients: references encoded, projected on the basis and decoded again."""
+    basis = getattr(model.relighter, "basis", None)
+    if basis is None:
+        return None
+    vectors = np.asarray(basis, np.float64)[:bases]
+    mono = vectors.shape[1] == len(truth.weight)
+    scale = model.encoding.scale(data.values(data.split("test"), model.points, model.quantity))
+    encoded = np.asarray(model.encoding.encode(truth.reference, scale), np.float64)
+    rows = np.moveaxis(encoded, 2, 1) if mono else encoded.reshape(len(encoded), 1, -1)
+    mean = np.asarray(getattr(model.relighter, "mean", 0.0), np.float64)
+    weights = entry_weights(data.area, "area", "mono" if mono else "multi").astype(np.float64)
+    # Least squares under area weights, whatever weights the basis was made for.
+    gram = (vectors * weights) @ vectors.T
+    coefficients = np.linalg.solve(gram, (((rows - mean) * weights) @ vectors.T).reshape(-1, len(vectors)).T).T
+    light = coefficients.reshape(*rows.shape[:2], -1) @ vectors + mean
+    back = np.moveaxis(light, 1, 2) if mono else light.reshape(encoded.shape)
+    decoded = np.asarray(model.encoding.decode(back.astype(np.float32), scale))
+    return truth.relative_rmse(decoded - truth.reference)
+
+
+def bases_curve(data: Dataset, config: Config, truth: Truth) -> list[tuple[int, float, float]]:
+    """Figure 14 of the paper: (bases, error of transfer, error of projection), as far as the data's rank goes."""
+    test, rows = data.split("test"), []
+    for bases in sorted(set(config.report.bases_curve)):
+        settings = {**config.methods.settings.get("svd-ridge", {}), "bases": bases}
+        points = min(config.points.count, len(data.samples.position))
+        model = fit_method(
+            data, config.fit, "svd-ridge", settings, points=points, quantity=config.points.quantity, seed=config.seed
+        )
+        got = model.relighter.report.bases
+        if rows and got <= rows[-1][0]:
+            break
+        predicted = model.predict(data.values(test, points, config.points.quantity))
+        error, floor = truth.relative_rmse(predicted - truth.reference), projection_error(data, model, truth)
+        if error is None or floor is None:
+            break
+        rows.append((got, error, floor))
+    return rows
+
+
+def spot_check(scene: Scene, data: Dataset, config: Config) -> dict[str, Any]:
+    """Held-out maps against the unbiased reference integrator at random texels.
+
+    The variance of both sides counts: that of the paths, and that of the bake from its two independent halves, pooled over
+    channels and the checked lightings (which share their noise) and over the texels of equal brightness.
+
+    Returns:
+      z-scores, the relative bias, and the values of both sides, (lightings, texels, 3); empty where it is switched off.
+    """
+    from ddprt.scene.atlas import build_atlas
+    from ddprt.transport.embree import Tracer
+    from ddprt.transport.reference import on_texels, trace_reference
+
+    test = data.split("test")[: config.report.spot_check_lightings]
+    count = min(config.report.spot_check_texels, int(data.covered.sum()))
+    if count == 0 or config.transport.bounces >= 0:
+        return {}
+    atlas = build_atlas(scene, config.atlas.resolution, config.atlas.padding)
+    rng = seeds.stream(config.seed, "spot check")
+    texels = np.sort(rng.choice(atlas.count, count, replace=False))
+    tracer = Tracer.of(scene, config.transport.threads)
+    estimates = [
+        trace_reference(
+            tracer,
+            scene,
+            data.lightings[index],
+            on_texels(tracer, atlas, texels),
+            count,
+            config.report.spot_check_samples,
+            seed=seeds.number(config.seed, "spot check", index),
+        )
+        for index in test
+    ]
+    truth = np.stack([estimate.indirect for estimate in estimates])
+    baked = data.maps("indirect", test)[:, texels].astype(np.float64)
+    noise = data.maps("noise", test)[:, texels].astype(np.float64)
+    variance = np.stack([estimate.indirect_variance for estimate in estimates]) + _pooled_variance(baked, noise)
+    scores = z_scores(baked, truth, variance)
+    return {**scores, "texels": count, "lightings": len(test), "baked": baked, "truth": truth, "rays": tracer.rays}
+
+
+def _pooled_variance(baked: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Variance of the bake as a share of brightness squared, from half differences; one share per lighting and channel."""
+    share = np.sum(noise**2, 1, keepdims=True) / np.maximum(np.sum(baked**2, 1, keepdims=True), 1e-300)
+    return share * baked**2
+
+
+def _relight_seconds(model: Model, values: np.ndarray) -> float:
+    """Median seconds of one frame through the public API, compiled before."""
+    model.predict(values[0])
+    times = []
+    for _ in range(_REPEATS):
+        start = time.perf_counter()
+        model.predict(values[0])
+        times.append(time.perf_counter() - start)
+    return float(np.median(times))
+
+
+def _judge_by_mean(scores: dict[str, dict[str, Any]]) -> None:
+    mean = scores.get("mean", {}).get("relative_rmse")
+    for name, score in scores.items():
+        if name != "mean" and mean is not None and score["status"] == "ok" and (score["relative_rmse"] or 0) > mean:
+            score["status"] = "worse_than_mean"
+
+
+def _distance_to_surface(data: Dataset, model: Model, indices: list[int]) -> np.ndarray:
+    anchors = [[a for light in data.lightings[i] if (a := light.anchor()) is not None] for i in indices]
+    tracer = model._tracer
+    return np.array([float(tracer.clearance(np.array(a)).min()) if a else np.nan for a in anchors])
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
