@@ -1,0 +1,5 @@
+"""`python -m ddprt` is `ddprt`."""
+
+from ddprt.cli import main
+
+main()

@@ -1,0 +1,287 @@
+"""The command line: `ddprt VERB [FILE] [--option value] [--section.key value]`.
+
+Exit 0 done, 2 the user can mend it (one line), 1 our fault, 130 interrupted and resumable. Imports stay inside the verbs,
+so that help is instant.
+"""
+
+import os
+import shlex
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NoReturn
+
+from ddprt import __version__
+from ddprt.errors import UserError, nearest
+
+REPORT_ISSUE = "this is our fault: run again with --debug and report what it prints"
+
+
+@dataclass
+class Call:
+    """What was typed after the verb."""
+
+    verb: str
+    files: list[str] = field(default_factory=list)
+    options: dict[str, str] = field(default_factory=dict)
+    overrides: dict[str, str] = field(default_factory=dict)
+    command: str = ""
+
+    @property
+    def quiet(self) -> bool:
+        """Whether progress is hidden."""
+        return "quiet" in self.options
+
+    def file(self, what: str) -> str:
+        """The one file argument."""
+        if len(self.files) != 1:
+            raise UserError(f"ddprt {self.verb}: got {len(self.files)} files, expected {what}; see `ddprt {self.verb} --help`")
+        return self.files[0]
+
+    def run(self) -> Any:
+        """The run folder and configuration that the arguments mean."""
+        from ddprt.config import load_config
+        from ddprt.pipeline import Run
+
+        source = self.file("a configuration such as configs/cornell.toml")
+        config = load_config(source, self.overrides)
+        default = Path(source).parent if Path(source).name == "config.toml" else Path("runs") / Path(source).stem
+        return Run(config, Path(self.options.get("out") or default), command=self.command, quiet=self.quiet)
+
+
+def run(call: Call) -> None:
+    """bake, fit, evaluate, report and export"""
+    for what, path in call.run().all().items():
+        print(f"{what + ':':<10}{path}")
+
+
+def inspect(call: Call) -> None:
+    """what a scene is, what light it calls for, and what a bake would do"""
+    from ddprt.pipeline_inspect import describe
+
+    print(describe(call.file("a configuration, a scene name or a mesh"), call.overrides))
+
+
+def bake(call: Call) -> None:
+    """render the dataset of direct and indirect lightmaps"""
+    job = call.run()
+    data = job.bake()
+    job.record(data)
+    print(f"dataset:  {data.folder}")
+
+
+def fit(call: Call) -> None:
+    """learn a model from a baked dataset"""
+    from ddprt.pipeline import open_run
+
+    job = call.run()
+    job.fit(open_run(job.folder))
+    print(f"model:    {job.folder / 'model.ddprt'}")
+
+
+def evaluate(call: Call) -> None:
+    """score all methods on held-out lightings and write the report"""
+    from ddprt.pipeline import open_run
+
+    job = call.run()
+    data = open_run(job.folder)
+    models, seconds = job.fit(data)
+    report = job.report(data, models, job.evaluate(data, models, seconds))
+    print(f"metrics:  {job.folder / 'metrics.json'}\nreport:   {report}")
+
+
+def relight(call: Call) -> None:
+    """turn a lighting into an indirect lightmap: ddprt relight MODEL --lighting lights.json --out relit.exr"""
+    import json
+
+    from ddprt.lights import load_lightings, parse_lighting
+    from ddprt.runtime.model_file import load_model
+    from ddprt.scene.exr import write_exr
+
+    source, out = call.options.get("lighting"), Path(call.options.get("out", "relit.exr"))
+    if source is None:
+        raise UserError('ddprt relight: got no --lighting, expected a JSON file or text such as [{"type": "point", ...}]')
+    if out.suffix != ".exr":
+        raise UserError(f"--out: got {out}, expected a path that ends in .exr")
+    model = load_model(call.file("a model folder such as runs/cornell/model.ddprt"))
+    if source.lstrip().startswith(("[", "{")):
+        try:
+            lightings = [parse_lighting(json.loads(source), "--lighting")]
+        except json.JSONDecodeError as error:
+            raise UserError(f"--lighting: not JSON: {error}") from None
+    else:
+        lightings = load_lightings(source)
+    for index, lighting in enumerate(lightings):
+        path = out if len(lightings) == 1 else out.with_stem(f"{out.stem}_{index:03d}")
+        write_exr(path, model.relight(lighting))
+        print(f"lightmap: {path}")
+
+
+def export(call: Call) -> None:
+    """write basis textures, matrices and a manifest for engines"""
+    from ddprt.runtime.model_file import load_model
+
+    job = call.run()
+    job.export(load_model(job.folder / "model.ddprt"))
+    print(f"textures: {job.folder / 'export'}")
+
+
+def verify(call: Call) -> None:
+    """find damaged or missing files of a dataset"""
+    from ddprt.dataset.store import Manifest, expected_files, read_description
+
+    folder = Path(call.file("a dataset or a run folder"))
+    folder = folder / "dataset" if (folder / "dataset").is_dir() else folder
+    description, manifest = read_description(folder), Manifest(folder)
+    faults = manifest.damaged()
+    faults += [f"{name}: not baked yet" for name in expected_files(description) if name not in manifest.entries]
+    if faults:
+        for fault in faults:
+            print(fault)
+        raise UserError(
+            f"{folder}: got {len(faults)} faulty files of {len(expected_files(description))}; "
+            "delete the damaged ones and run the bake again to make them anew"
+        )
+    print(f"{folder}: {len(manifest.entries)} files whole")
+
+
+def doctor(call: Call) -> None:
+    """check that everything ddprt needs works on this machine"""
+    from ddprt.pipeline_inspect import checkup
+
+    lines, fine = checkup()
+    print(lines)
+    if not fine:
+        raise UserError("doctor: something above needs mending")
+
+
+@dataclass(frozen=True)
+class Verb:
+    """One verb: its code, its own options, and whether it takes --section.key overrides."""
+
+    work: Callable[[Call], None]
+    options: dict[str, str] = field(default_factory=dict)
+    configured: bool = True
+
+
+_OUT = {"out": "DIR  folder of the run (default: runs/NAME)"}
+VERBS = {
+    "run": Verb(run, _OUT),
+    "inspect": Verb(inspect),
+    "bake": Verb(bake, _OUT),
+    "fit": Verb(fit, _OUT),
+    "eval": Verb(evaluate, _OUT),
+    "relight": Verb(
+        relight,
+        {"lighting": "FILE|JSON  a list of lightings, or one as text", "out": "FILE.exr  where to (default: relit.exr)"},
+        configured=False,
+    ),
+    "export": Verb(export, _OUT),
+    "verify": Verb(verify, configured=False),
+    "doctor": Verb(doctor, configured=False),
+}
+LATER = {"bench", "tune", "import", "view", "status"}
+FLAGS = {"quiet": "no progress", "debug": "tracebacks instead of one-line errors"}
+
+
+def usage() -> str:
+    """The text of `ddprt --help`."""
+    rows = "\n".join(f"  {name:<9}{verb.work.__doc__}" for name, verb in VERBS.items())
+    return (
+        f"ddprt {__version__}: learn how a scene answers to light, relight it without tracing a ray.\n\n"
+        f"usage: ddprt VERB [FILE] [--option value] [--section.key value]\n\n{rows}\n\n"
+        "`ddprt VERB --help` lists the options and every setting. Start with: ddprt run configs/cornell.toml\n"
+    )
+
+
+def main(arguments: list[str] | None = None) -> NoReturn:
+    """Entry point of the `ddprt` command."""
+    typed = sys.argv[1:] if arguments is None else arguments
+    debug = "--debug" in typed
+    try:
+        code = _dispatch([word for word in typed if word != "--debug"])
+        sys.stdout.flush()
+    except UserError as error:
+        if debug:
+            raise
+        print(f"ddprt: {error}", file=sys.stderr)
+        code = 2
+    except KeyboardInterrupt:
+        print("ddprt: interrupted; finished files are kept, the same command goes on from there", file=sys.stderr)
+        code = 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 0
+    except Exception as error:
+        if debug:
+            raise
+        print(f"ddprt: {type(error).__name__}: {error} ({REPORT_ISSUE})", file=sys.stderr)
+        code = 1
+    sys.exit(code)
+
+
+def _dispatch(words: list[str]) -> int:
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(usage(), end="")
+        return 0 if words else 2
+    if words[0] in ("-V", "--version"):
+        print(__version__)
+        return 0
+    name, rest = words[0], words[1:]
+    if name in LATER:
+        raise UserError(f"ddprt {name}: not built yet; known: {', '.join(VERBS)}")
+    if name not in VERBS:
+        raise UserError(f'no verb "{name}"{nearest(name, VERBS)}; known: {", ".join(VERBS)}')
+    if "-h" in rest or "--help" in rest:
+        _help(name)
+        return 0
+    VERBS[name].work(parse(name, rest))
+    return 0
+
+
+def parse(name: str, words: list[str]) -> Call:
+    """Words after a verb as files, options and overrides.
+
+    Raises:
+      UserError: unknown option, or one without a value.
+    """
+    verb = VERBS[name]
+    call = Call(name, command=shlex.join(["ddprt", name, *words]))
+    queue = list(words)
+    while queue:
+        word = queue.pop(0)
+        if not word.startswith("--"):
+            call.files.append(word)
+            continue
+        key, given, value = word[2:].partition("=")
+        if key in FLAGS and not given:
+            call.options[key] = ""
+            continue
+        known = key in verb.options or (verb.configured and ("." in key or key == "seed"))
+        if not known:
+            choices = [*verb.options, *FLAGS]
+            if verb.configured:
+                from ddprt.config import keys
+
+                choices += keys()
+            raise UserError(f"--{key}: unknown option{nearest(key, choices)}; `ddprt {name} --help` lists all")
+        if not given:
+            if not queue:
+                raise UserError(f"--{key}: got no value, expected one after it")
+            value = queue.pop(0)
+        (call.options if key in verb.options else call.overrides)[key] = value
+    return call
+
+
+def _help(name: str) -> None:
+    verb = VERBS[name]
+    rows = [f"  --{key} {text}" for key, text in {**verb.options, **FLAGS}.items()]
+    print(f"ddprt {name}: {verb.work.__doc__}\n\noptions:\n" + "\n".join(rows))
+    if verb.configured:
+        import tyro
+
+        from ddprt.config import Config
+
+        print("\nsettings (in the file as [section] key = value, here as --section.key value):")
+        tyro.cli(Config, args=["--help"], prog=f"ddprt {name} [FILE]", add_help=True)

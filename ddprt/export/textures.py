@@ -1,0 +1,116 @@
+"""Basis textures, transfer matrices and a manifest: everything a shader needs, nothing it does not.
+
+Mono channel packs four bases into an RGBA layer; multi channel gives each basis an RGB image. Every basis is scaled to a
+largest magnitude of 1, which spends the bits of half floats best, and the scale is pushed into its row of the matrix.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors.numpy import save_file
+
+from ddprt import __version__
+from ddprt.errors import UserError
+from ddprt.export.gutter import fill_gutter
+from ddprt.files import write_text, written_whole
+from ddprt.methods.svd_ridge import LinearTransfer
+from ddprt.runtime.model import Model
+from ddprt.scene.exr import write_exr
+
+SCHEMA = 1
+LAYER = 4  # bases per RGBA texture
+
+DECODE = [
+    "home = points.home; x[p] = mean over samples k with home[k] == p of (albedo[k] *) E_direct[k], per colour channel",
+    "s = norm of x over the points (per channel for mono, over all for multi); s = 0 gives black",
+    "z = x / s; in gamma space z = sign(z) |z|^(1/gamma)",
+    "u = matrix (z - offset) + intercept",
+    "y = mean texture + sum over bases of u[b] * basis texture b",
+    "y = max(y, 0); in gamma space y = y^gamma; E_indirect = s * y, in W/m²; radiance = albedo / pi * E_indirect",
+]
+
+
+def export_textures(model: Model, folder: str | Path, *, precision: str = "half", gutter: int = 4) -> list[Path]:
+    """Writes the export of a linear model.
+
+    Args:
+      model: of method svd-ridge.
+      folder: created if need be.
+      precision: "half" or "float" EXR.
+      gutter: texels that charts are extended by.
+    Returns:
+      The files, the manifest last.
+    Raises:
+      UserError: the method has no linear export, or the folder cannot be written.
+    """
+    relighter = model.relighter
+    if not isinstance(relighter, LinearTransfer):
+        raise UserError(f'export: got a model of method "{model.method}", expected svd-ridge; set fit.method = "svd-ridge"')
+    folder = Path(folder)
+    mono = model.encoding.channels == "mono"
+    bases = np.asarray(relighter.basis, np.float32)
+    scale = np.abs(bases).max(1, initial=0)
+    scale = np.where(scale > 0, scale, 1).astype(np.float32)
+    images = [_image(model, basis, gutter) for basis in bases / scale[:, None]]
+    half = precision == "half"
+    written, layers = [], []
+    if mono:
+        for first in range(0, len(images), LAYER):
+            group = images[first : first + LAYER]
+            group = group + [np.zeros_like(group[0])] * (LAYER - len(group))
+            layers.append((f"basis_{first // LAYER:02d}.exr", np.concatenate(group, 2)))
+    else:
+        layers = [(f"basis_{index:02d}.exr", image) for index, image in enumerate(images)]
+    has_mean = bool(np.any(relighter.mean))
+    if has_mean:
+        layers.append(("mean.exr", _image(model, np.asarray(relighter.mean), gutter)))
+    for name, image in layers:
+        write_exr(folder / name, image, half=half)
+        written.append(folder / name)
+
+    points = {
+        "position": model.samples.position,
+        "normal": model.samples.normal,
+        "albedo": model.samples.albedo,
+        "home": model.samples.nearest_point(model.points).astype(np.int32),
+    }
+    tensors = {
+        "matrix": np.asarray(relighter.matrix) * scale[None, :, None],
+        "offset": np.asarray(relighter.offset),
+        "intercept": np.asarray(relighter.intercept) * scale,
+    }
+    with written_whole(folder / "transfer.safetensors") as temporary:
+        save_file({name: np.ascontiguousarray(value, np.float32) for name, value in tensors.items()}, temporary)
+    write_text(folder / "points.json", json.dumps({name: np.asarray(value).tolist() for name, value in points.items()}) + "\n")
+    manifest: dict[str, Any] = {
+        "schema": SCHEMA,
+        "ddprt": __version__,
+        "scene": model.scene,
+        "width": model.covered.shape[1],
+        "height": model.covered.shape[0],
+        "bases": len(bases),
+        "points": model.points,
+        "samples": len(model.samples.position),
+        "quantity": model.quantity,
+        "space": model.encoding.space,
+        "gamma": model.encoding.gamma,
+        "channels": model.encoding.channels,
+        "precision": precision,
+        "layers": [name for name, _ in layers if name != "mean.exr"],
+        "packing": "basis 4 i + c is channel c of layer i" if mono else "layer i is basis i in RGB",
+        "mean": "mean.exr" if has_mean else None,
+        "basis_scale": scale.tolist(),
+        "matrix": {"file": "transfer.safetensors", "axes": "rgb, bases, points" if mono else "1, bases, points * rgb"},
+        "uv": "lightmap coordinates (TEXCOORD_1), origin top-left, row 0 at the top",
+        "unit": "irradiance in W/m2, before albedo",
+        "decode": DECODE,
+    }
+    write_text(folder / "manifest.json", json.dumps(manifest, indent=1, ensure_ascii=False) + "\n")
+    return [*written, folder / "transfer.safetensors", folder / "points.json", folder / "manifest.json"]
+
+
+def _image(model: Model, entries: np.ndarray, gutter: int) -> np.ndarray:
+    """Entries of a basis or mean as an image of 1 (mono) or 3 (multi) channels, charts extended."""
+    return fill_gutter(model.image(entries.reshape(int(model.covered.sum()), -1)), model.covered, gutter)

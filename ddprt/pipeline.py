@@ -1,0 +1,205 @@
+"""The whole chain: bake, fit, evaluate, report, export. Every step reads what the one before it left on disk."""
+
+import json
+import time
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ddprt import __version__
+from ddprt.config import Config
+from ddprt.dataset.generate import bake
+from ddprt.dataset.store import Dataset, open_dataset
+from ddprt.errors import UserError
+from ddprt.files import make_folder, write_text
+from ddprt.machine import machine, peak_memory_gib
+from ddprt.progress import Progress
+from ddprt.scene.files import load_scene
+from ddprt.scene.mesh import Scene
+from ddprt.transport.effects import Plan, plan
+
+# What learns and draws is imported where it is used: a bake needs no JAX and no matplotlib.
+
+
+class Run:
+    """One run folder, and the steps that fill it.
+
+    Args:
+      config: all settings.
+      folder: where everything goes.
+      command: as typed, for the record.
+      quiet: no progress.
+    """
+
+    def __init__(self, config: Config, folder: Path, *, command: str = "", quiet: bool = False) -> None:
+        self.config, self.folder, self.command = config, folder, command
+        self.progress = Progress(quiet)
+        self.started, self._clock = datetime.now(UTC), time.perf_counter()
+        self._scene: Scene | None = None
+
+    @property
+    def scene(self) -> Scene:
+        """The scene, loaded once; its repairs are told."""
+        if self._scene is None:
+            self._scene = load_scene(self.config.scene.name, **self.config.scene.parameters)
+            for note in self._scene.notes:
+                self.progress.say(f"scene: {note}")
+        return self._scene
+
+    def bake(self) -> Dataset:
+        """Bakes (or goes on with, or finds finished) the dataset; writes the resolved configuration."""
+        from ddprt.methods.names import check_names
+
+        check_names(self.config)
+        scene = self.scene
+        make_folder(self.folder)
+        data = bake(scene, config=self.config, out=self.folder / "dataset", progress=self.progress)
+        write_text(self.folder / "config.toml", self.config.to_toml())
+        return data
+
+    def fit(self, data: Dataset) -> tuple[dict[str, Any], dict[str, float]]:
+        """Fits every method of the comparison and saves the main one; returns models and seconds by name."""
+        from ddprt.methods.method import STATUSES
+        from ddprt.runtime.train import fit_config
+
+        names = [self.config.fit.method, *(name for name in self.config.methods.compare if name != self.config.fit.method)]
+        models, seconds = {}, {}
+        for name in names:
+            with self.progress.stage(f"fit {name}") as stage:
+                start = time.perf_counter()
+                models[name] = fit_config(data, self.config, name)
+                seconds[name] = time.perf_counter() - start
+                stage.facts["status"] = models[name].relighter.report.status
+        main = models[names[0]]
+        report = main.relighter.report
+        if report.bases and report.bases < self.config.fit.bases:
+            self.progress.say(
+                f"warning: fit.bases: asked for {self.config.fit.bases}, the data has rank {report.numerical_rank}: "
+                f"{report.bases} are given"
+            )
+        if report.status != "ok":
+            self.progress.say(f"warning: {names[0]}: {report.status}: {STATUSES[report.status]}")
+        main.save(self.folder / "model.ddprt")
+        return models, seconds
+
+    def evaluate(self, data: Dataset, models: dict[str, Any], seconds: dict[str, float]) -> Any:
+        """Scores the models, checks the held-out maps, and writes metrics.json."""
+        from ddprt.report.evaluate import bases_curve, evaluate, spot_check
+
+        with self.progress.stage("evaluate"):
+            evaluation = evaluate(data, models, seconds)
+        with self.progress.stage("bases curve"):
+            evaluation.curve = bases_curve(data, self.config, evaluation.truth)
+        with self.progress.stage("spot check") as stage:
+            evaluation.spot_check = spot_check(self.scene, data, self.config)
+            stage.facts |= {key: evaluation.spot_check[key] for key in ("rays",) if key in evaluation.spot_check}
+        summary = {key: value for key, value in evaluation.spot_check.items() if key not in ("baked", "truth", "variance")}
+        evaluation.metrics["spot_check"] = summary
+        evaluation.metrics["curve"] = [
+            {"bases": bases, "relative_rmse": error, "projection_relative_rmse": floor} for bases, error, floor in evaluation.curve
+        ]
+        write_text(self.folder / "metrics.json", json.dumps(evaluation.metrics, indent=1, allow_nan=False) + "\n")
+        return evaluation
+
+    def report(self, data: Dataset, models: dict[str, Any], evaluation: Any) -> Path:
+        """Writes report.html."""
+        from ddprt.report.page import write_page
+
+        path = self.folder / "report.html"
+        with self.progress.stage("report"):
+            write_page(
+                path,
+                evaluation=evaluation,
+                data=data,
+                models=models,
+                config=self.config,
+                stages=self.progress.stages,
+                scene=self.scene,
+                plan_effects=self.effects(data).effects,
+                command=self.command,
+            )
+        return path
+
+    def export(self, model: Any) -> list[Path]:
+        """Writes what engines load."""
+        from ddprt.export.textures import export_textures
+
+        with self.progress.stage("export"):
+            settings = self.config.export
+            return export_textures(model, self.folder / "export", precision=settings.precision, gutter=settings.gutter)
+
+    def effects(self, data: Dataset) -> Plan:
+        """The plan that the dataset was baked under."""
+        return plan(self.scene, data.lightings, bounces=self.config.transport.bounces)
+
+    def all(self) -> dict[str, Path]:
+        """Everything, and where it is."""
+        data = self.bake()
+        models, seconds = self.fit(data)
+        evaluation = self.evaluate(data, models, seconds)
+        report = self.report(data, models, evaluation)
+        main = next(iter(models.values()))
+        exported = self.export(main) if main.method == "svd-ridge" else []
+        self.record(data)
+        return {
+            "report": report,
+            "model": self.folder / "model.ddprt",
+            "metrics": self.folder / "metrics.json",
+            **({"textures": exported[0].parent} if exported else {}),
+        }
+
+    def record(self, data: Dataset) -> None:
+        """Writes run.json."""
+        stages = self.progress.stages
+        document = {
+            "schema": 1,
+            "ddprt": __version__,
+            "command": self.command,
+            "started": self.started.isoformat(timespec="seconds"),
+            "seconds": round(time.perf_counter() - self._clock, 3),
+            "peak_memory_gib": peak_memory_gib(),
+            "seed": self.config.seed,
+            "digest": self.config.digest(),
+            "stages": stages,
+            "effects": _effects(self.effects(data), stages, data),
+            "machine": machine(),
+        }
+        write_text(self.folder / "run.json", json.dumps(document, indent=1) + "\n")
+
+
+def open_run(folder: Path) -> Dataset:
+    """The finished dataset of a run folder.
+
+    Raises:
+      UserError: none is there.
+    """
+    if not (folder / "dataset" / "dataset.json").is_file():
+        raise UserError(f"{folder}: got no dataset, expected a run folder; run `ddprt bake` with the same --out first")
+    return open_dataset(folder / "dataset")
+
+
+def _effects(effects: Plan, stages: list[dict[str, Any]], data: Dataset) -> list[dict[str, Any]]:
+    """The plan with what each effect cost and what it gave.
+
+    Shares are of all irradiance of all lightings; direct light is shared out equally among the kinds of a lighting's lights.
+    """
+    weight = data.area / data.area.sum()
+    indices = range(len(data.lightings))
+    direct = np.array([np.einsum("tc,t->", data.maps("direct", [i])[0], weight) for i in indices])
+    indirect = float(sum(np.einsum("tc,t->", data.maps("indirect", [i])[0], weight) for i in indices))
+    total = float(direct.sum()) + indirect
+    by_kind: dict[str, float] = {}
+    for energy, lighting in zip(direct, data.lightings, strict=True):
+        for light in lighting:
+            by_kind[light.kind] = by_kind.get(light.kind, 0.0) + float(energy) / len(lighting)
+    rows = []
+    for effect in effects.effects:
+        bounces = effect.name == "diffuse bounces"
+        own = [s for s in stages if str(s["name"]).startswith("indirect" if bounces else "direct") and effect.called]
+        share = indirect if bounces else by_kind.get(effect.name.removesuffix(" lights"), 0.0)
+        cost = {"rays": sum(int(s.get("rays", 0)) for s in own), "seconds": round(sum(float(s["seconds"]) for s in own), 4)}
+        rows.append({**asdict(effect), **cost, "energy_share": share / total if total > 0 else 0.0})
+    return rows

@@ -1,0 +1,108 @@
+"""What would happen, without doing it: the text of `ddprt inspect` and `ddprt doctor`."""
+
+from pathlib import Path
+
+import numpy as np
+
+from ddprt.config import load_config
+from ddprt.errors import UserError
+from ddprt.machine import PACKAGES, installed, machine
+
+
+def describe(source: str, overrides: dict[str, str]) -> str:
+    """A scene, its atlas and its plan in words.
+
+    Args:
+      source: a configuration, a scene name or a mesh file.
+      overrides: of the configuration.
+    """
+    from ddprt.sampling.lightings import draw_lightings
+    from ddprt.scene.atlas import build_atlas
+    from ddprt.scene.files import load_scene
+    from ddprt.transport.effects import plan
+    from ddprt.transport.embree import Tracer
+
+    configured = Path(source).suffix == ".toml"
+    config = load_config(source if configured else None, overrides if configured else {**overrides, "scene.name": f'"{source}"'})
+    scene = load_scene(config.scene.name, **config.scene.parameters)
+    size = scene.bounds[1] - scene.bounds[0]
+    lines = [
+        f"scene       {scene.name}: {len(scene.triangles)} triangles, {scene.areas.sum():.4g} m², "
+        f"{size[0]:.4g} x {size[1]:.4g} x {size[2]:.4g} m",
+        *(f"note        {note}" for note in scene.notes),
+        *(f"material    {m.name}: albedo {np.round(m.albedo, 4).tolist()}{', textured' if m.texture is not None else ''}"
+          for m in scene.materials),
+    ]  # fmt: skip
+    atlas = build_atlas(scene, config.atlas.resolution, config.atlas.padding)
+    charts = len(np.unique(atlas.chart))
+    lines.append(
+        f"atlas       {atlas.resolution} x {atlas.resolution}: {atlas.count} texels covered "
+        f"({100 * atlas.count / atlas.resolution**2:.0f} %), {charts} charts, {atlas.texels_per_metre:.4g} texels per metre"
+    )
+    tracer = Tracer.of(scene)
+    draw = draw_lightings(
+        config.lightings, "train", min(8, config.lightings.train), bounds=scene.bounds, clearance=tracer.clearance, seed=config.seed
+    )
+    lines.append(f"lightings   {config.lightings.distribution}: {draw.candidates} positions tried, {draw.rejected} rejected (of 8 drawn)")
+    for effect in plan(scene, draw.lightings, bounces=config.transport.bounces).effects:
+        state = "called for" if effect.called else "left out"
+        bound = "" if effect.called else f"; at most {'any amount' if effect.bound is None else f'{effect.bound:.2g}'} of the direct light"
+        lines.append(f"effect      {effect.name}: {state}{' (forced)' if effect.forced else ''}: {effect.why}{bound}")
+    lightings = config.lightings.train + config.lightings.validation + config.lightings.test
+    gather = atlas.count * (config.transport.samples + config.transport.test_samples)
+    shadow = atlas.count * config.transport.direct_samples * lightings
+    lines.append(f"a bake      {lightings} lightings: {gather / 1e6:.0f} M gather rays, {shadow / 1e6:.0f} M shadow rays per lamp")
+    return "\n".join(lines)
+
+
+def checkup() -> tuple[str, bool]:
+    """The machine, the packages, and a ray, an EXR and a matrix product to see that they work."""
+    facts = machine()
+    lines = [f"{facts['processor']}, {facts['cores']} cores, {facts['memory_gib']} GiB, {facts['system']}, Python {facts['python']}"]
+    fine = True
+    for name in PACKAGES:
+        found = installed(name)
+        fine &= found is not None
+        lines.append(f"{'ok' if found else 'MISSING':<8}{name} {found or '- pip install ' + name}")
+    for name, check in (("ray tracing", _try_ray), ("EXR files", _try_exr), ("JAX", _try_jax)):
+        try:
+            lines.append(f"ok      {name}: {check()}")
+        except (UserError, ImportError, OSError, RuntimeError) as error:
+            fine = False
+            lines.append(f"BROKEN  {name}: {error}")
+    return "\n".join(lines), fine
+
+
+def _try_ray() -> str:
+    from ddprt.scene.library import build
+    from ddprt.transport.embree import Tracer
+
+    tracer = Tracer.of(build("furnace"))
+    hits = tracer.closest(np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32))
+    if not hits.front[0] or abs(hits.distance[0] - 1) > 0.01:
+        raise RuntimeError(f"a ray in a unit sphere got {hits.distance[0]}, expected 1")
+    return "a ray in a unit sphere hits its wall"
+
+
+def _try_exr() -> str:
+    import tempfile
+
+    from ddprt.scene.exr import read_exr, write_exr
+
+    image = np.arange(12, dtype=np.float32).reshape(2, 2, 3)
+    with tempfile.TemporaryDirectory() as folder:
+        write_exr(Path(folder) / "a.exr", image, half=True)
+        if not (read_exr(Path(folder) / "a.exr")[0] == image).all():
+            raise RuntimeError("an image came back changed")
+    return "an image comes back as it was written"
+
+
+def _try_jax() -> str:
+    import jax
+    import jax.numpy as jnp
+
+    with jax.enable_x64(True):
+        product = float(jnp.sum(jnp.ones((8, 8), jnp.float64) @ jnp.ones((8, 8), jnp.float64)))
+    if product != 512:
+        raise RuntimeError(f"a matrix product gave {product}, expected 512")
+    return f"{jax.default_backend()} with {jax.device_count()} device(s), float64 on demand"
