@@ -73,19 +73,15 @@ def bake(call: Call) -> None:
 
 def fit(call: Call) -> None:
     """learn a model from a baked dataset"""
-    from ddprt.pipeline import open_run
-
     job = call.run()
-    job.fit(open_run(job.folder))
+    job.fit(job.dataset())
     print(f"model:    {job.folder / 'model.ddprt'}")
 
 
 def evaluate(call: Call) -> None:
     """score all methods on held-out lightings and write the report"""
-    from ddprt.pipeline import open_run
-
     job = call.run()
-    data = open_run(job.folder)
+    data = job.dataset()
     models, seconds = job.fit(data)
     report = job.report(data, models, job.evaluate(data, models, seconds))
     print(f"metrics:  {job.folder / 'metrics.json'}\nreport:   {report}")

@@ -8,7 +8,7 @@ import hashlib
 import json
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -44,7 +44,7 @@ class LightingsConfig(Section):
     train: int = Field(128, ge=1, description="lightings to learn from")
     validation: int = Field(16, ge=1, description="lightings that learned methods stop early on")
     test: int = Field(32, ge=1, description="held-out lightings that every score is computed on")
-    file: str = Field("", description="JSON list of lightings to use instead of drawing; split in the order train, validation, test")
+    file: str = Field("", description="JSON list of lightings to use; split in the order train, validation, test")
     distribution: Literal["room", "around"] = Field(
         "room", description="room: free space inside the bounding box; around: a shell about the asset"
     )
@@ -65,7 +65,7 @@ class LightingsConfig(Section):
     size: float = Field(0.05, gt=0.0, description="area lights: half-edge or radius, as a fraction of the bounding radius")
 
     @model_validator(mode="after")
-    def _ranges_rise(self) -> Self:
+    def _ranges_rise(self) -> "LightingsConfig":
         for name in ("lights", "distance", "elevation_deg", "intensity", "saturation", "spot_outer_deg"):
             low, high = getattr(self, name)
             if low > high:
@@ -104,7 +104,10 @@ class TransportConfig(Section):
     test_samples: int = Field(1024, ge=2, le=131072, description="gather rays per texel for held-out lightings, in two halves")
     direct_samples: int = Field(4, ge=1, le=1024, description="shadow rays per texel and light")
     sender_resolution: int = Field(
-        0, ge=0, le=1024, description="texels per side of the coarser atlas that light bounces off; 0 chooses min(resolution, 64)"
+        0,
+        ge=0,
+        le=1024,
+        description="texels per side of the coarser atlas that light bounces off; 0: at most 64",
     )
     bounces: int = Field(-1, ge=-1, description="-1: as many as the scene calls for; 0, 1, 2...: forced, and reported")
     threads: int = Field(0, ge=0, description="0: one per core")
@@ -236,7 +239,7 @@ def explain(error: ValidationError, path: str | Path | None, overrides: dict[str
         names = sorted({key.rsplit(".", 1)[-1] for key in sections})
         return f"{source}: unknown key{nearest(place[-1], names)}; known here: {', '.join(names)}"
     if fault["type"] == "value_error":
-        return f"{source}: {str(fault['ctx']['error'])}" if place else f"{path}: {fault['ctx']['error']}"
+        return f"{source}: {fault['ctx']['error']!s}" if place else f"{path}: {fault['ctx']['error']}"
     related = [other for other in faults if ".".join(map(str, other["loc"])).startswith(dotted)]
     expected = " or ".join(dict.fromkeys(_expected(other) for other in related))
     return f"{source}: got {fault['input']!r}, expected {expected}{_choice_hint(fault)}"

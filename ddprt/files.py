@@ -2,8 +2,10 @@
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+
+import numpy as np
 
 from ddprt.errors import UserError
 
@@ -23,9 +25,12 @@ def written_whole(path: Path) -> Iterator[Path]:
             os.fsync(file.fileno())
         temporary.replace(path)
     except OSError as error:
-        raise UserError(f"{path}: cannot be written ({error.strerror or error}); free some space or choose another folder") from None
+        raise UserError(
+            f"{path}: cannot be written ({error.strerror or error}); free some space or choose another folder"
+        ) from None
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # below a regular file there is nothing to remove, and that is an error too
+            temporary.unlink()
 
 
 def make_folder(path: Path) -> None:
@@ -44,3 +49,27 @@ def write_text(path: Path, text: str) -> None:
     """Writes UTF-8 text whole."""
     with written_whole(path) as temporary:
         temporary.write_text(text, "utf-8")
+
+
+def write_tensors(path: Path, tensors: dict[str, np.ndarray]) -> None:
+    """Writes arrays as safetensors, whole."""
+    from safetensors.numpy import save
+
+    data = save({name: np.ascontiguousarray(array) for name, array in tensors.items()})
+    with written_whole(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def read_tensors(path: Path) -> dict[str, np.ndarray]:
+    """Reads safetensors.
+
+    Raises:
+      UserError: missing or damaged.
+    """
+    from safetensors import SafetensorError
+    from safetensors.numpy import load_file
+
+    try:
+        return load_file(path)
+    except (OSError, SafetensorError) as error:
+        raise UserError(f"{path}: not a whole tensor file ({error}); make it again") from None

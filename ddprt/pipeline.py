@@ -60,6 +60,23 @@ class Run:
         write_text(self.folder / "config.toml", self.config.to_toml())
         return data
 
+    def dataset(self) -> Dataset:
+        """The finished dataset of this run's folder.
+
+        Raises:
+          UserError: there is none, or it is of another scene or atlas.
+        """
+        if not (self.folder / "dataset" / "dataset.json").is_file():
+            raise UserError(f"{self.folder}: got no dataset, expected a run folder; run `ddprt bake` with the same --out first")
+        data = open_dataset(self.folder / "dataset")
+        there, atlas = data.description["scene"], data.description["atlas"]
+        if there["digest"] != self.scene.digest or atlas != self.config.atlas.model_dump():
+            raise UserError(
+                f'{self.folder}: got a dataset of scene "{there["name"]}" at {atlas["resolution"]}², expected '
+                f'"{self.scene.name}" at {self.config.atlas.resolution}² as it is now; bake again into another --out'
+            )
+        return data
+
     def fit(self, data: Dataset) -> tuple[dict[str, Any], dict[str, float]]:
         """Fits every method of the comparison and saves the main one; returns models and seconds by name."""
         from ddprt.methods.method import STATUSES
@@ -99,7 +116,8 @@ class Run:
         summary = {key: value for key, value in evaluation.spot_check.items() if key not in ("baked", "truth", "variance")}
         evaluation.metrics["spot_check"] = summary
         evaluation.metrics["curve"] = [
-            {"bases": bases, "relative_rmse": error, "projection_relative_rmse": floor} for bases, error, floor in evaluation.curve
+            {"bases": bases, "relative_rmse": error, "projection_relative_rmse": floor}
+            for bases, error, floor in evaluation.curve
         ]
         write_text(self.folder / "metrics.json", json.dumps(evaluation.metrics, indent=1, allow_nan=False) + "\n")
         return evaluation
@@ -168,17 +186,6 @@ class Run:
             "machine": machine(),
         }
         write_text(self.folder / "run.json", json.dumps(document, indent=1) + "\n")
-
-
-def open_run(folder: Path) -> Dataset:
-    """The finished dataset of a run folder.
-
-    Raises:
-      UserError: none is there.
-    """
-    if not (folder / "dataset" / "dataset.json").is_file():
-        raise UserError(f"{folder}: got no dataset, expected a run folder; run `ddprt bake` with the same --out first")
-    return open_dataset(folder / "dataset")
 
 
 def _effects(effects: Plan, stages: list[dict[str, Any]], data: Dataset) -> list[dict[str, Any]]:

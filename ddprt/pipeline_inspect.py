@@ -23,7 +23,9 @@ def describe(source: str, overrides: dict[str, str]) -> str:
     from ddprt.transport.embree import Tracer
 
     configured = Path(source).suffix == ".toml"
-    config = load_config(source if configured else None, overrides if configured else {**overrides, "scene.name": f'"{source}"'})
+    config = load_config(
+        source if configured else None, overrides if configured else {**overrides, "scene.name": f'"{source}"'}
+    )
     scene = load_scene(config.scene.name, **config.scene.parameters)
     size = scene.bounds[1] - scene.bounds[0]
     lines = [
@@ -41,24 +43,39 @@ def describe(source: str, overrides: dict[str, str]) -> str:
     )
     tracer = Tracer.of(scene)
     draw = draw_lightings(
-        config.lightings, "train", min(8, config.lightings.train), bounds=scene.bounds, clearance=tracer.clearance, seed=config.seed
+        config.lightings,
+        "train",
+        min(8, config.lightings.train),
+        bounds=scene.bounds,
+        clearance=tracer.clearance,
+        seed=config.seed,
     )
-    lines.append(f"lightings   {config.lightings.distribution}: {draw.candidates} positions tried, {draw.rejected} rejected (of 8 drawn)")
+    lines.append(
+        f"lightings   {config.lightings.distribution}: {draw.candidates} positions tried, {draw.rejected} rejected (of 8 drawn)"
+    )
     for effect in plan(scene, draw.lightings, bounces=config.transport.bounces).effects:
         state = "called for" if effect.called else "left out"
-        bound = "" if effect.called else f"; at most {'any amount' if effect.bound is None else f'{effect.bound:.2g}'} of the direct light"
+        bound = (
+            ""
+            if effect.called
+            else f"; at most {'any amount' if effect.bound is None else f'{effect.bound:.2g}'} of the direct light"
+        )
         lines.append(f"effect      {effect.name}: {state}{' (forced)' if effect.forced else ''}: {effect.why}{bound}")
     lightings = config.lightings.train + config.lightings.validation + config.lightings.test
     gather = atlas.count * (config.transport.samples + config.transport.test_samples)
     shadow = atlas.count * config.transport.direct_samples * lightings
-    lines.append(f"a bake      {lightings} lightings: {gather / 1e6:.0f} M gather rays, {shadow / 1e6:.0f} M shadow rays per lamp")
+    lines.append(
+        f"a bake      {lightings} lightings: {gather / 1e6:.0f} M gather rays, {shadow / 1e6:.0f} M shadow rays per lamp"
+    )
     return "\n".join(lines)
 
 
 def checkup() -> tuple[str, bool]:
     """The machine, the packages, and a ray, an EXR and a matrix product to see that they work."""
     facts = machine()
-    lines = [f"{facts['processor']}, {facts['cores']} cores, {facts['memory_gib']} GiB, {facts['system']}, Python {facts['python']}"]
+    lines = [
+        f"{facts['processor']}, {facts['cores']} cores, {facts['memory_gib']} GiB, {facts['system']}, Python {facts['python']}"
+    ]
     fine = True
     for name in PACKAGES:
         found = installed(name)

@@ -4,6 +4,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 _HEARTBEAT = 10.0  # seconds between lines where no terminal is
 
@@ -46,7 +47,7 @@ class Stage:
         self.name, self.total, self.done = name, total, 0
         self.facts: dict[str, float | int | str] = {}
         self.seconds = 0.0
-        self._live = None
+        self._live: Any = None
         self._quiet = quiet
         self._spoken = self._start = time.perf_counter()
 
@@ -55,7 +56,13 @@ class Stage:
             from rich.console import Console
             from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-            parts = TextColumn("{task.description:<22}"), BarColumn(), TimeElapsedColumn(), TextColumn("eta"), TimeRemainingColumn()
+            parts = (
+                TextColumn("{task.description:<22}"),
+                BarColumn(),
+                TimeElapsedColumn(),
+                TextColumn("eta"),
+                TimeRemainingColumn(),
+            )
             self._live = Progress(*parts, console=Console(stderr=True))
             self._task = self._live.add_task(self.name, total=self.total or None)
             self._live.start()

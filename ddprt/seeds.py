@@ -10,7 +10,8 @@ import numpy as np
 
 
 def _sequence(seed: int, name: str, index: tuple[int, ...]) -> np.random.SeedSequence:
-    return np.random.SeedSequence([seed, zlib.crc32(name.encode()), *index])
+    # The count of indices is part of the address: NumPy pads with zeros, so that (0, 5) and (0, 5, 0) would be one stream.
+    return np.random.SeedSequence([seed, zlib.crc32(name.encode()), len(index), *index])
 
 
 def stream(seed: int, name: str, *index: int) -> np.random.Generator:

@@ -17,6 +17,7 @@ from ddprt.config import Config
 from ddprt.dataset import store
 from ddprt.dataset.store import Dataset, Manifest, map_name
 from ddprt.errors import UserError
+from ddprt.files import write_tensors
 from ddprt.lights import Lighting, lighting_json, load_lightings
 from ddprt.progress import Progress
 from ddprt.sampling.lightings import draw_lightings
@@ -205,10 +206,10 @@ class _Bake:
             samples = place_samples(self.scene, config.count * config.supersample, on=config.on, seed=self.config.seed)
         if not manifest.holds("points.safetensors"):
             tensors = {"position": samples.position, "normal": samples.normal, "albedo": samples.albedo}
-            store.write_tensors(self.folder / "points.safetensors", {**tensors, "spacing": np.array([samples.spacing])})
+            write_tensors(self.folder / "points.safetensors", {**tensors, "spacing": np.array([samples.spacing])})
             manifest.add("points.safetensors")
         if not manifest.holds("scene.safetensors"):
-            store.write_tensors(self.folder / "scene.safetensors", {"corners": self.scene.corners})
+            write_tensors(self.folder / "scene.safetensors", {"corners": self.scene.corners})
             manifest.add("scene.safetensors")
         if not all(manifest.holds(f"atlas/{name}.exr") for name in ("position", "coverage")):
             store.write_atlas(self.folder, atlas, manifest)
@@ -216,7 +217,9 @@ class _Bake:
 
     def _direct(self, dataset: Dataset, manifest: Manifest, atlas: Atlas, samples: Samples) -> None:
         """Direct lightmaps and measured values, a lighting per task."""
-        todo = [i for i in range(len(dataset.lightings)) if not all(manifest.holds(map_name(k, i)) for k in ("direct", "measured"))]
+        todo = [
+            i for i in range(len(dataset.lightings)) if not all(manifest.holds(map_name(k, i)) for k in ("direct", "measured"))
+        ]
         count, seed = self.config.transport.direct_samples, self.config.seed
         texels = np.repeat(np.arange(atlas.count), count)
         grid = seeds.stream(seed, "texel positions").random((len(texels), 2), np.float32)
@@ -230,7 +233,7 @@ class _Bake:
             light = direct_irradiance(self.tracer, lights, place, normals, u).reshape(atlas.count, count, 3).mean(1)
             store.write_map(self.folder / map_name("direct", index), atlas.image(light))
             measured = measure(self.tracer, dataset.lightings[index], samples.position, samples.normal, seed=seed, index=index)
-            store.write_tensors(self.folder / map_name("measured", index), {"irradiance": measured})
+            write_tensors(self.folder / map_name("measured", index), {"irradiance": measured})
             return index
 
         with self.progress.stage("direct", len(todo)) as stage:
@@ -242,7 +245,9 @@ class _Bake:
             stage.facts["rays"] = self.tracer.rays - before
 
     def _refuse_darkness(self, dataset: Dataset) -> None:
-        brightness = np.array([store.read_map(self.folder / map_name("direct", i)).max() for i in range(len(dataset.lightings))])
+        brightness = np.array(
+            [store.read_map(self.folder / map_name("direct", i)).max() for i in range(len(dataset.lightings))]
+        )
         dark = np.flatnonzero(brightness == 0)
         if len(dark) == len(brightness):
             raise UserError(
@@ -256,10 +261,12 @@ class _Bake:
                 "inside a solid, outside the room, point away or have no intensity"
             )
 
-    def _indirect(self, dataset: Dataset, manifest: Manifest, atlas: Atlas, effects: Plan, split: str, indices: list[int]) -> None:
+    def _indirect(
+        self, dataset: Dataset, manifest: Manifest, atlas: Atlas, effects: Plan, split: str, indices: list[int]
+    ) -> None:
         """Indirect lightmaps of a group of lightings that share gather rays: train with validation, or test."""
         kinds = ["indirect", "noise"] if split == "test" else ["indirect"]
-        todo = [index for index in indices if not all(manifest.holds(map_name(kind, index)) for kind in kinds)]
+        todo = manifest.lacks(kinds, indices)
         if not todo:
             return
         halves = 2 if split == "test" else 1

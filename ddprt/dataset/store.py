@@ -1,25 +1,24 @@
 """The dataset on disk: EXR pairs, a description, and a manifest that only names whole files.
 
 A file is written under a temporary name, synced and renamed; then its line (name, bytes, sha256) is appended to
-`manifest.jsonl`. What the manifest names is whole, what it does not name does not count: an interrupted bake goes on from there.
+`manifest.jsonl`. What the manifest names is whole, what it does not name does not count: an interrupted bake
+goes on from there.
 """
 
 import hashlib
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
 
-from ddprt.axes import Bool, Float32, Float64, Int
+from ddprt.axes import Bool, Float32, Float64
 from ddprt.errors import UserError
-from ddprt.files import make_folder, write_text, written_whole
+from ddprt.files import make_folder, read_tensors, write_text
 from ddprt.lights import Lighting, parse_lighting
 from ddprt.sampling.points import Samples
 from ddprt.scene.atlas import Atlas
@@ -35,7 +34,7 @@ def map_name(kind: str, index: int) -> str:
     return f"{kind}/{index:06d}.{'safetensors' if kind == 'measured' else 'exr'}"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Dataset:
     """A baked (or imported) dataset, read on demand; make one with `ddprt.bake` or `ddprt.open_dataset`.
 
@@ -52,7 +51,9 @@ class Dataset:
     @cached_property
     def lightings(self) -> tuple[Lighting, ...]:
         """All lightings, by index."""
-        return tuple(parse_lighting(entry["lights"], f"lightings[{i}]") for i, entry in enumerate(self.description["lightings"]))
+        return tuple(
+            parse_lighting(entry["lights"], f"lightings[{i}]") for i, entry in enumerate(self.description["lightings"])
+        )
 
     def split(self, name: str) -> list[int]:
         """Indices of the lightings of "train", "validation" or "test"."""
@@ -83,13 +84,13 @@ class Dataset:
     @cached_property
     def samples(self) -> Samples:
         """Where direct light was measured, all supersamples in progressive order."""
-        tensors = _read_tensors(self.folder / "points.safetensors")
+        tensors = read_tensors(self.folder / "points.safetensors")
         return Samples(tensors["position"], tensors["normal"], tensors["albedo"], float(tensors["spacing"][0]))
 
     @cached_property
     def occluders(self) -> Float64[np.ndarray, "triangles 3 3"]:
         """Triangle corners, metres: what casts shadows."""
-        return _read_tensors(self.folder / "scene.safetensors")["corners"]
+        return read_tensors(self.folder / "scene.safetensors")["corners"]
 
     def maps(self, kind: str, indices: Sequence[int]) -> Float32[np.ndarray, "lightings texels 3"]:
         """Lightmaps of the covered texels in W/m²; kind is "direct", "indirect" or (held-out lightings) "noise"."""
@@ -100,7 +101,7 @@ class Dataset:
 
     def measured(self, indices: Sequence[int]) -> Float32[np.ndarray, "lightings samples 3"]:
         """Direct irradiance at all samples, W/m²."""
-        tensors = [_read_tensors(self.folder / map_name("measured", index)) for index in indices]
+        tensors = [read_tensors(self.folder / map_name("measured", index)) for index in indices]
         return np.stack([entry["irradiance"] for entry in tensors]) if tensors else np.empty((0, 0, 3), np.float32)
 
     def values(self, indices: Sequence[int], points: int, quantity: str) -> Float32[np.ndarray, "lightings points 3"]:
@@ -120,9 +121,9 @@ def average_into_points(
     """Supersampled irradiance to one value per point; see `Dataset.values`."""
     home = samples.nearest_point(points)
     weighted = irradiance * samples.albedo.astype(np.float32) if quantity == "radiosity" else irradiance
-    total = np.zeros((len(irradiance), points, 3), np.float32)
-    np.add.at(total, (slice(None), home), weighted)
-    return total / np.bincount(home, minlength=points).astype(np.float32)[:, None]
+    share = np.zeros((points, len(home)), np.float32)
+    share[home, np.arange(len(home))] = 1 / np.bincount(home, minlength=points)[home]
+    return share @ weighted
 
 
 def open_dataset(folder: str | Path) -> Dataset:
@@ -137,7 +138,7 @@ def open_dataset(folder: str | Path) -> Dataset:
     missing = [name for name in expected_files(dataset.description) if name not in named]
     if missing:
         raise UserError(
-            f"{folder}: got {len(missing)} files missing (first {missing[0]}), expected a finished bake; run the bake again to go on"
+            f"{folder}: got {len(missing)} files missing (first {missing[0]}), expected a finished bake; run it again to go on"
         )
     return dataset
 
@@ -218,6 +219,10 @@ class Manifest:
         path = self.folder / name
         return entry is not None and path.is_file() and path.stat().st_size == entry["bytes"]
 
+    def lacks(self, kinds: Sequence[str], indices: Iterable[int]) -> list[int]:
+        """The lightings that some kind of map is still missing of."""
+        return [index for index in indices if not all(self.holds(map_name(kind, index)) for kind in kinds)]
+
     def damaged(self) -> list[str]:
         """One line for each named file that is missing or differs from its hash."""
         faults = []
@@ -249,7 +254,9 @@ def read_map(path: Path) -> Float32[np.ndarray, "height width 3"]:
     try:
         return np.ldexp(image, int(attributes.get("ddprt_exposure", "0")))
     except ValueError:
-        raise UserError(f"{path}: got exposure {attributes['ddprt_exposure']!r}, expected a whole number; bake it again") from None
+        raise UserError(
+            f"{path}: got exposure {attributes['ddprt_exposure']!r}, expected a whole number; bake it again"
+        ) from None
 
 
 def write_atlas(folder: Path, atlas: Atlas, manifest: Manifest) -> None:
@@ -261,27 +268,12 @@ def write_atlas(folder: Path, atlas: Atlas, manifest: Manifest) -> None:
         manifest.add(f"atlas/{name}.exr")
 
 
-def write_tensors(path: Path, tensors: dict[str, np.ndarray]) -> None:
-    """Arrays as safetensors, whole or not at all."""
-    with written_whole(path) as temporary:
-        save_file({name: np.ascontiguousarray(array) for name, array in tensors.items()}, temporary)
-
-
 def write_description(folder: Path, description: dict[str, Any]) -> None:
     """dataset.json, whole or not at all."""
     make_folder(folder)
     write_text(folder / "dataset.json", json.dumps(description, indent=1) + "\n")
 
 
-def _read_tensors(path: Path) -> dict[str, np.ndarray]:
-    try:
-        return load_file(path)
-    except (OSError, SafetensorError) as error:
-        raise UserError(f"{path}: not a whole tensor file ({error}); bake it again") from None
-
-
 def _sha256(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-

@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors.numpy import save_file
 
 from ddprt import __version__
 from ddprt.errors import UserError
 from ddprt.export.gutter import fill_gutter
-from ddprt.files import write_text, written_whole
+from ddprt.files import write_tensors, write_text
 from ddprt.methods.svd_ridge import LinearTransfer
 from ddprt.runtime.model import Model
 from ddprt.scene.exr import write_exr
@@ -81,8 +80,7 @@ def export_textures(model: Model, folder: str | Path, *, precision: str = "half"
         "offset": np.asarray(relighter.offset),
         "intercept": np.asarray(relighter.intercept) * scale,
     }
-    with written_whole(folder / "transfer.safetensors") as temporary:
-        save_file({name: np.ascontiguousarray(value, np.float32) for name, value in tensors.items()}, temporary)
+    write_tensors(folder / "transfer.safetensors", {name: value.astype(np.float32) for name, value in tensors.items()})
     write_text(folder / "points.json", json.dumps({name: np.asarray(value).tolist() for name, value in points.items()}) + "\n")
     manifest: dict[str, Any] = {
         "schema": SCHEMA,

@@ -18,6 +18,9 @@ RANK_CUT = 1e-7
 """Singular values below this share of the largest are rounding of the float32 data, not light."""
 
 
+Status = Literal["ok", "rank_deficient", "no_signal"]
+
+
 @dataclass(frozen=True)
 class Basis:
     """An orthonormal basis under entry weights: U W U^T = Id.
@@ -36,7 +39,7 @@ class Basis:
     coefficients: Float[Array, "columns bases"]
     singular_values: Float[Array, " columns"]
     rank: int
-    status: Literal["ok", "rank_deficient", "no_signal"]
+    status: Status
 
 
 def fit_basis(
@@ -69,7 +72,7 @@ def fit_basis(
             (_coefficients(columns[:, tile], mean[tile], weights[tile], vectors[:, tile]) for tile in tiles),
             jnp.zeros((len(columns), kept), jnp.float64),
         )
-        status = "no_signal" if rank == 0 else "rank_deficient" if kept < bases else "ok"
+        status: Status = "no_signal" if rank == 0 else "rank_deficient" if kept < bases else "ok"
         return Basis(vectors, mean.astype(jnp.float32), coefficients, sigma, rank, status)
 
 

@@ -47,11 +47,10 @@ class Encoding:
         return jnp.sign(relative) * jnp.where(size > 0, jnp.where(size > 0, size, 1) ** (1 / self.gamma), 0)
 
     def decode(
-        self, encoded: Float[Array, "lightings places 3"], scale: Float[Array, "lightings 3"], *, clamp: bool = True
+        self, encoded: Float[Array, "lightings places 3"], scale: Float[Array, "lightings 3"], *, clamp: bool | Array = True
     ) -> Float[Array, "lightings places 3"]:
         """The inverse of `encode`, in W/m²; negative light is clamped to 0 unless asked otherwise."""
-        if clamp:
-            encoded = jnp.maximum(encoded, 0)
+        encoded = jnp.where(clamp, jnp.maximum(encoded, 0), encoded)
         if self.space == "gamma":
             encoded = jnp.sign(encoded) * jnp.abs(encoded) ** self.gamma
         return encoded * scale[:, None]

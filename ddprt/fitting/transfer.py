@@ -30,12 +30,13 @@ class Transfer:
       intercept: mean of the coefficients, zero without intercept.
       ridge: the weight that was used; for a ridge per point its mean.
       singular_values: of the measurements, falling.
-      condition: largest over smallest singular value; infinite where the smallest is 0.
+      condition: largest singular value over the smallest one that counts towards the rank; 0 without signal.
       rank: numerical rank of the measurements.
       leave_one_out: root of the weighted mean squared leave-one-out residual of a row's coefficients.
       path: leave-one-out residual at every ridge tried, as (ridge, residual) rows; empty unless it was chosen.
-      status: "ok"; "rank_deficient": some directions of the measurements carry nothing, which the ridge or the rank cut
-        leaves out; "ill_conditioned": they nearly do, and no ridge holds them back; "no_signal": nothing was measured.
+      status: "ok"; "rank_deficient": the measurements have fewer independent directions than there are coefficients to tell
+        apart; "ill_conditioned": directions that nearly carry nothing decide, and no ridge holds them back; "no_signal":
+        nothing was measured.
     """
 
     matrix: Float[Array, "bases points"]
@@ -94,13 +95,12 @@ def fit_transfer(
             chosen = 1.0 if per_point is not None else float(ridge)  # type: ignore[arg-type]
         matrix = (QtC.T * _shrink(S, chosen)) @ Pt * stretch
         loo = float(_loo_path(Q, S, QtC, C - start, weight, jnp.array([chosen]), intercept)[0])
-        rank = int(jnp.sum(S > RANK_CUT * S[0])) if float(S[0]) > 0 else 0
-        condition = float(S[0] / S[-1]) if float(S[-1]) > 0 else float("inf")
-        status = _status(S, rank, condition, chosen)
+        rank = int(jnp.sum(RANK_CUT * S[0] < S)) if float(S[0]) > 0 else 0
+        condition = float(S[0] / S[rank - 1]) if rank else 0.0
+        status = _status(S, rank, C.shape[1], condition, chosen)
         used = float(jnp.mean(per_point)) if per_point is not None else chosen
-        return Transfer(
-            matrix.astype(jnp.float32), offset.astype(jnp.float32), start.astype(jnp.float32), used, S, condition, rank, loo, path, status
-        )  # fmt: skip
+        M, d0, c0 = (part.astype(jnp.float32) for part in (matrix, offset, start))
+        return Transfer(M, d0, c0, used, S, condition, rank, loo, path, status)
 
 
 def _per_point(ridge: float | tuple[float, ...] | str, points: int) -> Array | None:
@@ -115,7 +115,7 @@ def _per_point(ridge: float | tuple[float, ...] | str, points: int) -> Array | N
 
 def _shrink(S: Array, ridge: Array | float) -> Array:
     """S / (S² + ridge), where directions without signal get 0: at ridge 0 this is the pseudo-inverse."""
-    held = S > RANK_CUT * S[0]
+    held = RANK_CUT * S[0] < S
     return jnp.where(held | (ridge > 0), S / jnp.where(S**2 + ridge > 0, S**2 + ridge, 1), 0)
 
 
@@ -137,10 +137,12 @@ def _loo_path(
     return jax.lax.map(residual, ridges)
 
 
-def _status(S: Array, rank: int, condition: float, ridge: float) -> Literal["ok", "rank_deficient", "ill_conditioned", "no_signal"]:
+def _status(
+    S: Array, rank: int, bases: int, condition: float, ridge: float
+) -> Literal["ok", "rank_deficient", "ill_conditioned", "no_signal"]:
     if rank == 0:
         return "no_signal"
-    held = ridge > (RANK_CUT * float(S[0])) ** 2
-    if rank < len(S):
+    if rank < bases:
         return "rank_deficient"
+    held = ridge > (float(S[0]) / ILL_CONDITIONED) ** 2
     return "ill_conditioned" if condition > ILL_CONDITIONED and not held else "ok"

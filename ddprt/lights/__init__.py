@@ -38,15 +38,15 @@ def parse_lighting(records: Any, where: str = "lighting") -> Lighting:
     Raises:
       UserError: unknown type, missing or unknown key, wrong type or range.
     """
-    if isinstance(records, dict) or isinstance(records, tuple(LIGHTS.values())):
+    if isinstance(records, (dict, *LIGHTS.values())):
         records = [records]
     if not isinstance(records, list | tuple):
         raise UserError(f"{where}: got {type(records).__name__}, expected a light or a list of lights")
     for index, record in enumerate(records):
-        if isinstance(record, dict) and record.get("type") not in LIGHTS:
+        if isinstance(record, dict) and record.get("type") not in list(LIGHTS):
             hint = nearest(str(record.get("type")), LIGHTS)
             raise UserError(
-                f'{where}[{index}].type: got {record.get("type")!r}, expected one of {", ".join(sorted(LIGHTS))}{hint}'
+                f"{where}[{index}].type: got {record.get('type')!r}, expected one of {', '.join(sorted(LIGHTS))}{hint}"
             )
     try:
         return tuple(_ADAPTER.validate_python(tuple(records)))

@@ -1,6 +1,6 @@
 """Lights with size: rectangles and spheres. They emit; they never occlude."""
 
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -25,7 +25,7 @@ class RectLight(LightModel):
     radiance: Colour
 
     @model_validator(mode="after")
-    def _has_area(self) -> Self:
+    def _has_area(self) -> "RectLight":
         if not np.cross(self.half_u, self.half_v).any():
             raise ValueError("half_u and half_v: got parallel vectors, expected a rectangle with area")
         return self
@@ -44,7 +44,7 @@ class RectLight(LightModel):
         weight = np.divide(area * cosine, squared, out=np.zeros_like(squared), where=squared > 0)
         return Illumination(direction, np.sqrt(squared), weight[:, None] * np.asarray(self.radiance, dtype))
 
-    def translated(self, offset: Float[np.ndarray, "3"]) -> Self:
+    def translated(self, offset: Float[np.ndarray, "3"]) -> "RectLight":
         """See `Light`."""
         return self.model_copy(update={"center": moved(self.center, offset)})
 
@@ -52,7 +52,7 @@ class RectLight(LightModel):
         """See `Light`."""
         return np.array(self.center)
 
-    def scaled(self, factor: float) -> Self:
+    def scaled(self, factor: float) -> "RectLight":
         """See `Light`."""
         return self.model_copy(update={"radiance": brightened(self.radiance, factor)})
 
@@ -87,7 +87,7 @@ class SphereLight(LightModel):
         irradiance = solid_angle[:, None] * np.asarray(self.radiance, dtype)
         return Illumination(direction, np.maximum(along - chord, 0).astype(dtype), irradiance)
 
-    def translated(self, offset: Float[np.ndarray, "3"]) -> Self:
+    def translated(self, offset: Float[np.ndarray, "3"]) -> "SphereLight":
         """See `Light`."""
         return self.model_copy(update={"center": moved(self.center, offset)})
 
@@ -95,7 +95,6 @@ class SphereLight(LightModel):
         """See `Light`."""
         return np.array(self.center)
 
-    def scaled(self, factor: float) -> Self:
+    def scaled(self, factor: float) -> "SphereLight":
         """See `Light`."""
         return self.model_copy(update={"radiance": brightened(self.radiance, factor)})
-

@@ -1,6 +1,6 @@
 """Lights too far away to have a place: directional."""
 
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -26,7 +26,7 @@ class DirectionalLight(LightModel):
             np.broadcast_to(np.asarray(self.irradiance, points.dtype), points.shape),
         )
 
-    def translated(self, offset: Float[np.ndarray, "3"]) -> Self:
+    def translated(self, offset: Float[np.ndarray, "3"]) -> "DirectionalLight":
         """See `Light`; it has no place to move."""
         return self
 
@@ -34,6 +34,6 @@ class DirectionalLight(LightModel):
         """See `Light`."""
         return None
 
-    def scaled(self, factor: float) -> Self:
+    def scaled(self, factor: float) -> "DirectionalLight":
         """See `Light`."""
         return self.model_copy(update={"irradiance": brightened(self.irradiance, factor)})

@@ -5,7 +5,7 @@ are float32 or float64 NumPy, world space, metres.
 """
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Protocol, Self, runtime_checkable
+from typing import Annotated, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
@@ -62,7 +62,7 @@ class Light(Protocol):
         """Samples the light from each point: the mean over uniform `u` of irradiance * cosine * visible is E."""
         ...
 
-    def translated(self, offset: Float[np.ndarray, "3"]) -> Self:
+    def translated(self, offset: Float[np.ndarray, "3"]) -> "Light":
         """The same light moved by `offset` metres: transport works relative to the scene's centre."""
         ...
 
@@ -70,7 +70,7 @@ class Light(Protocol):
         """Where the light stands, to tell whether that is inside a solid; None for distant lights."""
         ...
 
-    def scaled(self, factor: float) -> Self:
+    def scaled(self, factor: float) -> "Light":
         """The same light, `factor` times as strong."""
         ...
 

@@ -1,6 +1,6 @@
 """Lights without size: points and spots."""
 
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -26,7 +26,7 @@ class PointLight(LightModel):
         irradiance = reciprocal[:, None] * np.asarray(self.intensity, points.dtype)
         return Illumination(unit(away), np.sqrt(squared), irradiance)
 
-    def translated(self, offset: Float[np.ndarray, "3"]) -> Self:
+    def translated(self, offset: Float[np.ndarray, "3"]) -> "PointLight":
         """See `Light`."""
         return self.model_copy(update={"position": moved(self.position, offset)})
 
@@ -34,7 +34,7 @@ class PointLight(LightModel):
         """See `Light`."""
         return np.array(self.position)
 
-    def scaled(self, factor: float) -> Self:
+    def scaled(self, factor: float) -> "PointLight":
         """See `Light`."""
         return self.model_copy(update={"intensity": brightened(self.intensity, factor)})
 
@@ -52,7 +52,7 @@ class SpotLight(LightModel):
     outer_deg: Annotated[float, Field(gt=0, le=90)] = 45.0
 
     @model_validator(mode="after")
-    def _cone_opens(self) -> Self:
+    def _cone_opens(self) -> "SpotLight":
         if self.inner_deg >= self.outer_deg:
             raise ValueError(f"inner_deg: got {self.inner_deg}, expected less than outer_deg ({self.outer_deg})")
         return self
@@ -65,7 +65,7 @@ class SpotLight(LightModel):
         falloff = np.clip((-full.direction @ axis - outer) / max(inner - outer, 1e-6), 0, 1) ** 2
         return Illumination(full.direction, full.distance, full.irradiance * falloff[:, None].astype(points.dtype))
 
-    def translated(self, offset: Float[np.ndarray, "3"]) -> Self:
+    def translated(self, offset: Float[np.ndarray, "3"]) -> "SpotLight":
         """See `Light`."""
         return self.model_copy(update={"position": moved(self.position, offset)})
 
@@ -73,6 +73,6 @@ class SpotLight(LightModel):
         """See `Light`."""
         return np.array(self.position)
 
-    def scaled(self, factor: float) -> Self:
+    def scaled(self, factor: float) -> "SpotLight":
         """See `Light`."""
         return self.model_copy(update={"intensity": brightened(self.intensity, factor)})

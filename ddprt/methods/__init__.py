@@ -37,7 +37,8 @@ def make_method(name: str, shared: Mapping[str, Any], own: Mapping[str, Any]) ->
     for setting in own:
         if setting not in known:
             raise UserError(
-                f"methods.settings.{name}.{setting}: unknown setting{nearest(setting, known)}; known: {', '.join(sorted(known))}"
+                f"methods.settings.{name}.{setting}: unknown setting{nearest(setting, known)}; "
+                f"known: {', '.join(sorted(known))}"
             )
     try:
         return method(**{**{key: value for key, value in shared.items() if key in known}, **own})

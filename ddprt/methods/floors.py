@@ -82,4 +82,6 @@ class NearestLighting(Method):
 
     def fit(self, train: Examples, validation: Examples, *, key: Array) -> NearestMaps:
         """See `Method`."""
-        return NearestMaps(train.frame.values, train.indirect, FitReport("ok" if bool((train.scale > 0).any()) else "no_signal"))
+        return NearestMaps(
+            train.frame.values, train.indirect, FitReport("ok" if bool((train.scale > 0).any()) else "no_signal")
+        )

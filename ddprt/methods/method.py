@@ -87,7 +87,10 @@ class FitReport:
 class Relighter(Protocol):
     """What a fit leaves: everything needed to answer a frame."""
 
-    report: FitReport
+    @property
+    def report(self) -> FitReport:
+        """What the fit says about itself."""
+        ...
 
     def predict(self, frame: Frame) -> Float[Array, "frames texels 3"]:
         """Encoded indirect light; linear in nothing by contract, NaN for nothing."""

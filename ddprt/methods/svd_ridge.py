@@ -3,7 +3,7 @@
 Linear, closed-form and small: the reference point that learned methods must beat.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar, Literal
 
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from pydantic import Field
 
 from ddprt.fitting.basis import entry_weights, fit_basis
-from ddprt.fitting.transfer import fit_transfer
+from ddprt.fitting.transfer import Transfer, fit_transfer
 from ddprt.methods.method import Examples, FitReport, Frame, Method, array_bytes, as_pytree, columns, measurements
 
 
@@ -32,9 +32,7 @@ class LinearTransfer:
         """u for each frame."""
         frames, groups = len(frame.values), len(self.matrix)
         values = jnp.moveaxis(frame.values, 2, 1) if groups == 3 else frame.values.reshape(frames, 1, -1)
-        return (
-            jnp.einsum("gbp,fgp->fgb", self.matrix, values - self.offset, precision="highest") + self.intercept
-        )
+        return jnp.einsum("gbp,fgp->fgb", self.matrix, values - self.offset, precision="highest") + self.intercept
 
     def predict(self, frame: Frame) -> Float[Array, "frames texels 3"]:
         """See `Relighter`."""
@@ -42,6 +40,11 @@ class LinearTransfer:
         if len(self.matrix) == 3:
             return jnp.moveaxis(light, 1, 2)
         return light.reshape(len(light), -1, 3)
+
+    def truncated(self, bases: int) -> "LinearTransfer":
+        """The same with all but the first `bases` vectors set to zero; shapes stay, so nothing compiles again."""
+        kept = (jnp.arange(self.basis.shape[0]) < bases)[:, None]
+        return replace(self, basis=self.basis * kept)
 
     @property
     def nbytes(self) -> int:
@@ -71,7 +74,7 @@ class SvdRidge(Method):
         centre = self.centre == "mean"
         basis = fit_basis(rows, entries, bases=max(self.bases - centre, 1), centre=centre)
         per_group = _spread(basis.coefficients, train, basis.vectors.shape[0])
-        transfers = []
+        transfers: list[Transfer | None] = []
         for group, inputs in enumerate(measurements(train)):
             importance = train.scale[:, group] ** 2
             lit = np.flatnonzero(np.asarray(importance) > 0)
@@ -80,7 +83,11 @@ class SvdRidge(Method):
                 continue
             transfers.append(
                 fit_transfer(
-                    inputs[lit], per_group[group][lit], ridge=self.ridge, importance=importance[lit], intercept=centre
+                    inputs[lit],
+                    jnp.asarray(per_group[group][lit]),
+                    ridge=self.ridge,
+                    importance=importance[lit],
+                    intercept=centre,
                 )
             )
         shape = (basis.vectors.shape[0], measurements(train).shape[2])

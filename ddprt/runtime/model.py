@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from ddprt.methods.method import Frame, Relighter
 from ddprt.sampling.points import Samples
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Model:
     """Relights a scene; make one with `ddprt.fit` or `ddprt.load_model`.
 
@@ -65,7 +65,7 @@ class Model:
         if not np.isfinite(measured).all():
             raise UserError("values: got NaN or infinity, expected finite W/m²; check the shading of the measurement points")
         frames = jnp.asarray(measured[None] if single else measured)
-        light = np.asarray(_relight(self.relighter, self.encoding, frames, *self._places, clamp=clamp))
+        light = np.asarray(_relight(self.relighter, self.encoding, frames, *self._places, clamp))
         return light[0] if single else light
 
     def measure(self, lighting: Lighting | Light | Sequence[dict[str, Any]] | dict[str, Any]) -> np.ndarray:
@@ -112,15 +112,14 @@ class Model:
         return Tracer(self.occluders)
 
 
-@partial(jax.jit, static_argnames="clamp")
+@jax.jit
 def _relight(
     relighter: Relighter,
     encoding: Encoding,
     values: Float[Array, "frames points 3"],
     positions: Float[Array, "points 3"],
     normals: Float[Array, "points 3"],
-    *,
-    clamp: bool,
+    clamp: bool | Array,
 ) -> Float[Array, "frames texels 3"]:
     scale = encoding.scale(values)
     frame = Frame(encoding.encode(values, scale), positions, normals)

@@ -7,12 +7,10 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
 
 from ddprt import __version__
 from ddprt.errors import UserError
-from ddprt.files import write_text, written_whole
+from ddprt.files import read_tensors, write_tensors, write_text
 from ddprt.fitting.encoding import Encoding
 from ddprt.methods import METHODS
 from ddprt.methods.method import FitReport
@@ -59,8 +57,7 @@ def save_model(model: Model, folder: Path) -> None:
         "report": asdict(model.relighter.report),
         "unit": "W/m2",
     }
-    with written_whole(folder / "tensors.safetensors") as temporary:
-        save_file({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}, temporary)
+    write_tensors(folder / "tensors.safetensors", tensors)
     write_text(folder / "model.json", json.dumps(document, indent=1) + "\n")
 
 
@@ -80,10 +77,7 @@ def load_model(folder: str | Path) -> Model:
         raise UserError(f"{folder / 'model.json'}: not a model description; fit it again") from None
     if schema != SCHEMA:
         raise UserError(f"{folder}: got model schema {schema}, expected {SCHEMA}; fit it again with this version")
-    try:
-        tensors = load_file(folder / "tensors.safetensors")
-    except (OSError, SafetensorError) as error:
-        raise UserError(f"{folder / 'tensors.safetensors'}: not a whole tensor file ({error}); fit it again") from None
+    tensors = read_tensors(folder / "tensors.safetensors")
     relighter_type = METHODS[document["method"]].relighter
     try:
         return _assemble(document, tensors, relighter_type)

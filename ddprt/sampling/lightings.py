@@ -77,7 +77,7 @@ def _draw_light(
         position = bounds.mean(0) + outward * rng.uniform(*config.distance) * radius
         aim, rejected, tried = -outward, 0, 1
     else:
-        room = size if kind in ("rect", "sphere") else 0.0
+        room = {"rect": np.sqrt(2) * size, "sphere": size}.get(kind, 0.0)  # a square reaches as far as its corners
         position, rejected, tried = _free_position(config, bounds, clearance, room, rng)
         aim = warp.sample_sphere(rng.random((1, 2)))[0]
     if kind == "spot" and config.distribution == "around":

@@ -22,7 +22,7 @@ _DENSITY = 5  # candidates per sample kept, as the paper advises
 _ALPHA, _BETA, _GAMMA = 8, 0.65, 1.5  # the paper's weight exponents
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Samples:
     """Places where direct light is measured, in progressive order.
 
@@ -145,7 +145,8 @@ def _thin(position: np.ndarray, alive: np.ndarray, keep: int, area: float) -> tu
     current = crowding.tolist()
     heap = [(-value, index) for index, value in enumerate(current)]
     heapq.heapify(heap)
-    gone, removed = [False] * count, []
+    gone = [False] * count
+    removed: list[int] = []
     while count - len(removed) > keep:
         value, index = heapq.heappop(heap)
         if gone[index] or -value != current[index]:

@@ -13,7 +13,7 @@ from ddprt.scene.raster import rasterise
 from ddprt.scene.unwrap import unwrap
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SurfaceSampler:
     """Uniform points on groups of surface pieces, a group being a texel or a coarser sender.
 
@@ -70,7 +70,7 @@ class SurfaceSampler:
         return positions, np.take(self.triangle, piece)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Senders:
     """The coarser atlas that light bounces off: blocks of texels that never cross charts.
 
@@ -87,7 +87,7 @@ class Senders:
     sampler: SurfaceSampler
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Atlas:
     """Covered texels in row-major order, and where they lie on the scene.
 
@@ -140,13 +140,13 @@ class Atlas:
     @cached_property
     def lookup(self) -> Int32[np.ndarray, "height width"]:
         """`slot`, with holes next to covered texels closed: a hit on a chart's edge always finds a texel."""
-        lookup = self.slot.copy()
+        padded = np.pad(self.slot, 1, constant_values=-1)  # so that nothing wraps around the image
+        lookup = padded.copy()
         for axis, shift in ((0, 1), (0, -1), (1, 1), (1, -1)):
-            shifted = np.roll(self.slot, shift, axis)
-            lookup = np.where(lookup < 0, shifted, lookup)
-        return lookup
+            lookup = np.where(lookup < 0, np.roll(padded, shift, axis), lookup)
+        return np.ascontiguousarray(lookup[1:-1, 1:-1])
 
-    def image(self, values: Float[np.ndarray, "texels *channels"], fill: float = 0.0) -> np.ndarray:
+    def image(self, values: Float[np.ndarray, "texels ..."], fill: float = 0.0) -> np.ndarray:
         """Values of covered texels as a (height, width, ...) image, row 0 at the top."""
         image = np.full((self.resolution**2, *values.shape[1:]), fill, values.dtype)
         image[self.texel] = values

@@ -12,7 +12,11 @@ HALF_MAX = 65504.0
 
 
 def write_exr(
-    path: Path, image: Float[np.ndarray, "height width channels"], *, half: bool = False, attributes: dict[str, str] | None = None
+    path: Path,
+    image: Float[np.ndarray, "height width channels"],
+    *,
+    half: bool = False,
+    attributes: dict[str, str] | None = None,
 ) -> None:
     """Writes a ZIP-compressed scanline EXR, row 0 at the top.
 
@@ -34,7 +38,15 @@ def write_exr(
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(attributes or {})}
     name = {1: "Y", 3: "RGB", 4: "RGBA"}[channels]
     with written_whole(path) as temporary:
-        OpenEXR.File(header, {name: stored[..., 0].copy() if channels == 1 else stored}).write(str(temporary))
+        file = OpenEXR.File(header, {name: stored[..., 0].copy() if channels == 1 else stored})
+        try:
+            file.write(str(temporary))
+        except RuntimeError as error:  # what a full disk is to OpenEXR
+            raise OSError(str(error).rstrip(".").rsplit(". ", 1)[-1]) from None
+        try:
+            read_exr(temporary)  # OpenEXR keeps silent when its last buffer, up to 8 KB, does not fit on the disk
+        except UserError:
+            raise OSError("only a part of it fitted") from None
 
 
 def read_exr(path: Path) -> tuple[Float[np.ndarray, "height width channels"], dict[str, str]]:
@@ -50,6 +62,7 @@ def read_exr(path: Path) -> tuple[Float[np.ndarray, "height width channels"], di
     try:
         with OpenEXR.File(str(path)) as file:
             channels = file.channels()
+            names = ", ".join(channels)  # closing empties the table
             header = {key: value for key, value in file.header().items() if isinstance(value, str)}
             for name in ("RGBA", "RGB", "Y"):
                 if name in channels:
@@ -59,7 +72,7 @@ def read_exr(path: Path) -> tuple[Float[np.ndarray, "height width channels"], di
         raise
     except Exception as error:
         raise UserError(f"{path}: not a whole EXR image ({str(error).splitlines()[0]}); bake or copy it again") from None
-    raise UserError(f"{path}: got channels {', '.join(channels)}, expected RGB, RGBA or Y")
+    raise UserError(f"{path}: got channels {names}, expected RGB, RGBA or Y")
 
 
 def exposure_for(peak: float) -> int:
@@ -68,4 +81,4 @@ def exposure_for(peak: float) -> int:
 
 
 def _fits(image: np.ndarray, half: bool) -> bool:
-    return bool(np.isfinite(image).all() and (not half or np.abs(image).max(initial=0) <= HALF_MAX))
+    return bool(np.isfinite(image).all() and np.abs(image).max(initial=0) <= (HALF_MAX if half else np.finfo(np.float32).max))

@@ -27,7 +27,7 @@ class Material:
     texture: np.ndarray | None = field(default=None, repr=False, compare=False)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
     """A checked triangle mesh; make one with `ddprt.load_scene`.
 
@@ -97,9 +97,7 @@ class Scene:
         state.update(repr([material.albedo for material in self.materials]).encode())
         return state.hexdigest()[:16]
 
-    def albedo_at(
-        self, triangle: Int[np.ndarray, " n"], barycentric: Float[np.ndarray, "n 3"]
-    ) -> Float[np.ndarray, "n 3"]:
+    def albedo_at(self, triangle: Int[np.ndarray, " n"], barycentric: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Linear albedo at points given by triangle and weights of its three corners."""
         material = self.material[triangle]
         albedo = np.array([entry.albedo for entry in self.materials])[material]

@@ -4,6 +4,7 @@ import hashlib
 import os
 import tempfile
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 import xatlas
@@ -35,7 +36,7 @@ def unwrap(
     try:
         with np.load(path) as stored:
             return stored["uv"], stored["chart"]
-    except (OSError, ValueError, KeyError, EOFError):
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile):
         pass  # absent, or damaged: make it anew
     uv, chart = _unwrap(scene, resolution, padding)
     _remember(path, uv=uv, chart=chart)

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ddprt import warp
-from ddprt.axes import Bool, Float, Float32, Float64, Int32
+from ddprt.axes import Bool, Float32, Float64, Int32
 from ddprt.errors import UserError
 from ddprt.scene.mesh import Scene
 
@@ -107,9 +107,7 @@ class Tracer:
         """Whether nothing lies between each origin and its light, `distances` metres away."""
         self._count(len(origins))
         reach = np.maximum(distances - self.offset, 0).astype(np.float32)
-        seen = self._embree.run(
-            np.ascontiguousarray(origins), np.ascontiguousarray(directions), dists=reach, query="OCCLUDED"
-        )
+        seen = self._embree.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), dists=reach, query="OCCLUDED")
         return np.asarray(seen) != 0
 
     def _count(self, rays: int) -> None:

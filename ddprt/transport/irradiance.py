@@ -51,9 +51,7 @@ def irradiance(
     # A probe may float in free air, where even a convex scene sends light to it: only black scenes end at direct light.
     black = all(max(material.albedo) == 0 for material in scene.materials)
     start = on_points(tracer, place, facing / length)
-    estimate = trace_reference(
-        tracer, scene, parsed, start, len(place), samples, seed=seed, bounces=0 if black else -1
-    )
+    estimate = trace_reference(tracer, scene, parsed, start, len(place), samples, seed=seed, bounces=0 if black else -1)
     if return_variance:
         return estimate.direct, estimate.indirect, estimate.direct_variance, estimate.indirect_variance
     return estimate.direct, estimate.indirect

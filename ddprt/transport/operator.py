@@ -10,7 +10,7 @@ Senders are the receivers' own texels in blocks (`Atlas.senders`), so their dire
 costs no ray. The price is light averaged inside a block: a bias that the report's spot check measures against `reference`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -132,7 +132,7 @@ def _rows(
     receivers: SurfaceSampler,
     pattern: Float32[np.ndarray, "samples 4"],
     shifts: Float32[np.ndarray, "receivers 4"],
-):  # type: ignore[no-untyped-def]
+) -> Iterator[tuple[slice, Float32[np.ndarray, "tile senders"]]]:
     """Tiles of G in order: (receiver slice, shares of the hemisphere that see each sender)."""
     samples, count = len(pattern), len(senders.area)
     size = max(1, _TILE_RAYS // samples)

@@ -21,9 +21,7 @@ from ddprt.transport.embree import Tracer, lifted
 _BATCH = 1 << 15  # paths traced together
 _MAX_SURVIVAL = 0.95  # a white closed room would never let a path go
 
-Start = Callable[
-    [Int[np.ndarray, " n"], np.random.Generator], tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]
-]
+Start = Callable[[Int[np.ndarray, " n"], np.random.Generator], tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]]
 """Maps receiver indices to positions (centred frame) and geometric normals."""
 
 
@@ -38,7 +36,15 @@ class Estimate:
 
 
 def trace_reference(
-    tracer: Tracer, scene: Scene, lighting: Lighting, start: Start, receivers: int, samples: int, *, seed: int, bounces: int = -1
+    tracer: Tracer,
+    scene: Scene,
+    lighting: Lighting,
+    start: Start,
+    receivers: int,
+    samples: int,
+    *,
+    seed: int,
+    bounces: int = -1,
 ) -> Estimate:
     """Estimates direct and indirect irradiance by independent paths.
 
