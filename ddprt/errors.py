@@ -13,5 +13,6 @@ class UserError(ValueError):
 
 def nearest(word: str, known: Iterable[str]) -> str:
     """The known spelling closest to `word` as a hint ("; did you mean ...?"), or an empty string."""
-    close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
+    names = list(known)
+    close = difflib.get_close_matches(word, names, n=1, cutoff=0.6) or [n for n in names if word and n.startswith(word)]
     return f'; did you mean "{close[0]}"?' if close else ""

@@ -31,6 +31,9 @@ from ddprt.transport.measure import measure
 
 _SENDER_RESOLUTION = 64  # senders along a side where transport.sender_resolution leaves it open
 
+_NAMED = 8  # doubtful lightings that a warning spells out
+_STRENGTHS = ("intensity", "irradiance", "radiance")
+
 Splits = Mapping[str, Sequence[Lighting]]
 
 
@@ -91,7 +94,6 @@ class _Bake:
     def run(self, given: Sequence[Lighting] | Splits | None, keep_alive: Any) -> Dataset:
         with self.progress.stage("lightings") as stage:
             entries, drawn = self._entries(given)
-            self._warn_of_blocked(entries)
             stage.facts |= {"lightings": len(entries), **drawn}
         effects = plan(self.scene, [lighting for _, lighting in entries], bounces=self.config.transport.bounces)
         description = self._description(entries, effects, drawn)
@@ -105,7 +107,7 @@ class _Bake:
             stage.facts["samples"] = len(samples.position)
         dataset = Dataset(self.folder, description, keep_alive)
         self._direct(dataset, manifest, atlas, samples)
-        self._refuse_darkness(dataset)
+        self._judge_lightings(dataset)
         self._indirect(dataset, manifest, atlas, effects, "train", dataset.split("train") + dataset.split("validation"))
         self._indirect(dataset, manifest, atlas, effects, "test", dataset.split("test"))
         return dataset
@@ -142,19 +144,6 @@ class _Bake:
             if not splits.get(name):
                 raise UserError(f"lightings: got none for {name}, expected at least 1 each for train, validation and test")
         return [(name, lighting) for name in store.SPLITS for lighting in splits[name]], drawn
-
-    def _warn_of_blocked(self, entries: Sequence[tuple[str, Lighting]]) -> None:
-        """Names lightings whose lamps all stand inside a solid or behind the walls."""
-        anchors = [(index, light.anchor()) for index, (_, lighting) in enumerate(entries) for light in lighting]
-        placed = [(index, anchor) for index, anchor in anchors if anchor is not None]
-        if not placed:
-            return
-        free = self.tracer.clearance(np.array([anchor for _, anchor in placed])) > 0
-        lit = {index for (index, _), ok in zip(placed, free, strict=True) if ok} | {i for i, a in anchors if a is None}
-        blocked = sorted({index for index, _ in placed} - lit)
-        if blocked:
-            names = ", ".join(f"{index} ({entries[index][0]})" for index in blocked[:8]) + (", ..." if len(blocked) > 8 else "")
-            self.progress.say(f"warning: {len(blocked)} lightings stand inside a solid or behind the walls: {names}")
 
     def _description(self, entries: Sequence[tuple[str, Lighting]], effects: Plan, drawn: dict[str, int]) -> dict[str, Any]:
         config = self.config
@@ -244,22 +233,38 @@ class _Bake:
                 stage.advance()
             stage.facts["rays"] = self.tracer.rays - before
 
-    def _refuse_darkness(self, dataset: Dataset) -> None:
-        brightness = np.array(
-            [store.read_map(self.folder / map_name("direct", i)).max() for i in range(len(dataset.lightings))]
-        )
-        dark = np.flatnonzero(brightness == 0)
-        if len(dark) == len(brightness):
+    def _judge_lightings(self, dataset: Dataset) -> None:
+        """Names lightings that light nothing or stand where no lamp should, and why; refuses a bake of darkness."""
+        faults, dark = [], 0
+        for index, lighting in enumerate(dataset.lightings):
+            black = not store.read_map(self.folder / map_name("direct", index)).any()
+            dark += black
+            why = self._misplaced(lighting, black)
+            if why:
+                split = dataset.description["lightings"][index]["split"]
+                faults.append(f"{index} ({split}): {'lights nothing: it ' if black else ''}{why}")
+        if dark == len(dataset.lightings):
             raise UserError(
-                f"lightings: all {len(dark)} light nothing, expected light on the scene; "
-                "check their positions (inside a solid, outside the room) and intensities"
+                f"lightings: all {dark} light nothing, expected light on the scene; the first: {faults[0]}; "
+                "check positions, directions and intensities"
             )
-        if len(dark):
-            names = ", ".join(f"{i} ({dataset.description['lightings'][i]['split']})" for i in dark[:8])
-            self.progress.say(
-                f"warning: {len(dark)} lightings light nothing: {names}{', ...' if len(dark) > 8 else ''}; their lamps stand "
-                "inside a solid, outside the room, point away or have no intensity"
-            )
+        if faults:
+            more = f"; and {len(faults) - _NAMED} more" if len(faults) > _NAMED else ""
+            self.progress.say(f"warning: {len(faults)} doubtful lightings: {'; '.join(faults[:_NAMED])}{more}")
+
+    def _misplaced(self, lighting: Lighting, black: bool) -> str:
+        """Why a lighting is doubtful, empty where it is not."""
+        places = [anchor for light in lighting if (anchor := light.anchor()) is not None]
+        if len(places) == len(lighting) and not (self.tracer.clearance(np.array(places)) > 0).any():
+            return "stands inside a solid or behind a wall"
+        if not black:
+            return ""
+        brightness = [value for light in lighting_json(lighting) for key in _STRENGTHS for value in light.get(key, ())]
+        if not any(brightness):
+            return "has no intensity"
+        low, high = self.scene.bounds
+        outside = [((place < low) | (place > high)).any() for place in places]
+        return "stands outside the scene" if len(places) == len(lighting) and all(outside) else "faces away or is shadowed"
 
     def _indirect(
         self, dataset: Dataset, manifest: Manifest, atlas: Atlas, effects: Plan, split: str, indices: list[int]

@@ -197,9 +197,11 @@ class Manifest:
             self._whole += len(line)
 
     def add(self, name: str) -> None:
-        """Names a file that has just been moved into place."""
+        """Names a file that has just been moved into place; naming the same contents again adds nothing."""
         path = self.folder / name
         entry = {"file": name, "bytes": path.stat().st_size, "sha256": _sha256(path)}
+        if self.entries.get(name) == entry:
+            return
         line = (json.dumps(entry) + "\n").encode()
         try:
             with self.path.open("r+b" if self.path.exists() else "wb") as file:

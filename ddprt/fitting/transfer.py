@@ -121,7 +121,7 @@ def _shrink(S: Array, ridge: Array | float) -> Array:
 
 @jax.jit
 def _loo_path(
-    Q: Array, S: Array, QtC: Array, C: Array, weight: Array, ridges: Array, intercept: bool
+    Q: Array, S: Array, QtC: Array, C: Array, weight: Array, ridges: Array, intercept: bool | Array
 ) -> Float[Array, " ridges"]:
     """Leave-one-out residual of every ridge in closed form: e_k = (c_k - fitted_k) / (1 - h_kk)."""
 

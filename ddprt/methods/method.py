@@ -11,7 +11,7 @@ the mean lightmap or `FitReport.status` says so.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -84,6 +84,7 @@ class FitReport:
     loss: tuple[tuple[int, float, float], ...] = ()
 
 
+@runtime_checkable
 class Relighter(Protocol):
     """What a fit leaves: everything needed to answer a frame."""
 
@@ -156,8 +157,3 @@ def measurements(examples: Examples) -> Float[Array, "groups lightings inputs"]:
     values = examples.frame.values
     return jnp.moveaxis(values, 2, 0) if examples.channels == "mono" else values.reshape(1, len(values), -1)
 
-
-def validation_error(relighter: Relighter, examples: Examples) -> float:
-    """Weighted squared error of encoded light in units of W/m²; what "better than the mean" compares."""
-    error = (relighter.predict(examples.frame) - examples.indirect) * examples.scale[:, None]
-    return float(jnp.mean(jnp.einsum("ltc,t->lc", error**2, jnp.asarray(examples.area / examples.area.sum(), jnp.float32))))

@@ -16,7 +16,7 @@ from pydantic import Field
 from ddprt.fitting.basis import entry_weights, fit_basis
 from ddprt.methods.method import Examples, FitReport, Frame, Method, array_bytes, as_pytree, columns, measurements, static
 
-Layers = tuple[tuple[Float[Array, "inputs outputs"], Float[Array, " outputs"]], ...]
+Layers = tuple[tuple[Float[Array, "_ _"], Float[Array, " _"]], ...]
 
 
 @as_pytree
@@ -24,8 +24,8 @@ Layers = tuple[tuple[Float[Array, "inputs outputs"], Float[Array, " outputs"]], 
 class Perceptron:
     """Dense layers with GELU between them, then the basis; channels are told apart by a one-hot input."""
 
-    weights: tuple[Float[Array, "inputs outputs"], ...]
-    biases: tuple[Float[Array, " outputs"], ...]
+    weights: tuple[Float[Array, "_ _"], ...]
+    biases: tuple[Float[Array, " _"], ...]
     basis: Float[Array, "bases entries"]
     spread: Float[Array, " bases"]
     groups: int = static(default=3)

@@ -68,7 +68,6 @@ def evaluate(data: Dataset, models: Mapping[str, Model], fit_seconds: Mapping[st
             "bases": report.bases,
             "status": report.status,
         }
-    _judge_by_mean(scores)
     main = next(iter(models.values()))
     report = main.relighter.report
     metrics = {
@@ -194,13 +193,6 @@ def _relight_seconds(model: Model, values: np.ndarray) -> float:
         model.predict(values[0])
         times.append(time.perf_counter() - start)
     return float(np.median(times))
-
-
-def _judge_by_mean(scores: dict[str, dict[str, Any]]) -> None:
-    mean = scores.get("mean", {}).get("relative_rmse")
-    for name, score in scores.items():
-        if name != "mean" and mean is not None and score["status"] == "ok" and (score["relative_rmse"] or 0) > mean:
-            score["status"] = "worse_than_mean"
 
 
 def _distance_to_surface(data: Dataset, model: Model, indices: list[int]) -> np.ndarray:

@@ -1,6 +1,7 @@
 """From a dataset to a Model."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -13,7 +14,8 @@ from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.fitting.encoding import Encoding
 from ddprt.methods import make_method
-from ddprt.methods.method import Examples, Frame
+from ddprt.methods.floors import MeanLightmap
+from ddprt.methods.method import Examples, Frame, Relighter
 from ddprt.runtime.model import Model
 
 
@@ -78,6 +80,7 @@ def fit_method(
     encoding = Encoding(config.space, config.gamma, config.channels)
     train, validation = (examples(data, split, encoding, config, points, quantity) for split in ("train", "validation"))
     relighter = method.fit(train, validation, key=jax.random.key(seeds.number(seed, f"method {name}")))
+    relighter = _judged(relighter, encoding, train, validation)
     return Model(
         name,
         relighter,
@@ -90,6 +93,21 @@ def fit_method(
         data.occluders,
         {key: data.description["scene"][key] for key in ("name", "digest")},
     )
+
+
+def _judged(relighter: Relighter, encoding: Encoding, train: Examples, validation: Examples) -> Relighter:
+    """The law that a method beats the mean lightmap on its validation set, or says that it does not."""
+    mean = MeanLightmap().fit(train, validation, key=jax.random.key(0))
+    weights = jnp.asarray(validation.area / validation.area.sum(), jnp.float32)
+    truth = encoding.decode(validation.indirect, validation.scale)
+
+    def error(candidate: Relighter) -> float:
+        light = encoding.decode(candidate.predict(validation.frame), validation.scale)
+        return float(jnp.einsum("ltc,t->", (light - truth) ** 2, weights))
+
+    if relighter.report.status != "ok" or error(relighter) <= error(mean):
+        return relighter
+    return replace(relighter, report=replace(relighter.report, status="worse_than_mean"))  # type: ignore[type-var]
 
 
 def examples(data: Dataset, split: str, encoding: Encoding, config: FitConfig, points: int, quantity: str) -> Examples:

@@ -1,6 +1,6 @@
 """What stays still.
 
-In come a name of the library or a file (glTF, OBJ, PLY, STL) and what a user's own code holds as arrays; every one of them
-passes `checks.checked`. Out goes a `Scene`: triangles that face the free space, diffuse materials in linear Rec.709, and
+Enters: a name of the library or a file (glTF, OBJ, PLY, STL) and what a user's own code holds as arrays; every one of them
+passes `checks.checked`. Leaves: a `Scene`: triangles that face the free space, diffuse materials in linear Rec.709, and
 notes on all that was repaired or ignored. Lights, cameras, rays, random numbers and JAX never enter.
 """

@@ -125,7 +125,7 @@ class Tracer:
         hits = self.closest(origins, np.tile(directions, (len(positions), 1)))
         hit = (hits.triangle >= 0).reshape(-1, _PROBES)
         back = hit & ~hits.front.reshape(-1, _PROBES)
-        nearest = np.where(hit, hits.distance.reshape(-1, _PROBES), np.inf).min(1)
+        nearest = np.where(hit, hits.distance.reshape(-1, _PROBES), np.inf).min(1).astype(np.float64)
         return np.where(2 * back.sum(1) > hit.sum(1), 0.0, nearest)
 
     def map(self, work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:

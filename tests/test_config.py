@@ -1,0 +1,98 @@
+"""One line for every fault, and what comes out goes in again."""
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ddprt.config import Config, keys, load_config
+from ddprt.errors import UserError
+
+CONFIGS = sorted((Path(__file__).parent.parent / "configs").glob("*.toml"))
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda p: p.stem)
+def test_resolved_configuration_is_accepted_again(path: Path, tmp_path: Path) -> None:
+    config = load_config(path)
+    resolved = tmp_path / "config.toml"
+    resolved.write_text(config.to_toml())
+    assert load_config(resolved) == config
+    assert load_config(resolved).digest() == config.digest()
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda p: p.stem)
+def test_configurations_explain_themselves(path: Path) -> None:
+    assert path.read_text().startswith("#"), "a comment says what the job is"
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 1e-30, 0.5, 1e30]), st.text(max_size=20))
+def test_any_value_survives_the_round_trip(seed: int, ridge: float, name: str) -> None:
+    import tomllib
+
+    config = Config.model_validate({"seed": seed, "fit": {"ridge": ridge}, "scene": {"name": name}})
+    assert Config.model_validate(tomllib.loads(config.to_toml())) == config
+
+
+def test_overrides_win_over_the_file() -> None:
+    config = load_config(CONFIGS[0], {"fit.bases": "7", "fit.ridge": "1e-3", "lightings.kinds": '["spot", "point"]'})
+    assert (config.fit.bases, config.fit.ridge, config.lightings.kinds) == (7, 1e-3, ("spot", "point"))
+    assert load_config(None, {"fit.space": "gamma", "seed": "5"}).seed == 5
+    assert load_config(None, {"methods.settings.mlp": "{steps = 3}"}).methods.settings == {"mlp": {"steps": 3}}
+    assert load_config(None, {"scene.parameters.albedo": "0.25"}).scene.parameters == {"albedo": 0.25}
+
+
+FAULTS = {
+    "unknown section": ('[fitt]\nbases = 3\n', {}, ["fitt", "unknown key", 'did you mean "fit"?']),
+    "unknown key": ("[fit]\nbase = 3\n", {}, ["fit.base", "unknown key", 'did you mean "bases"?']),
+    "wrong type": ('[fit]\nbases = "many"\n', {}, ["fit.bases", "got 'many'", "integer"]),
+    "out of range": ("[fit]\nbases = 0\n", {}, ["fit.bases", "got 0", "greater than or equal to 1"]),
+    "unknown word": ('[fit]\nspace = "lineer"\n', {}, ["fit.space", "'lineer'", 'did you mean "linear"?']),
+    "not finite": ("[fit]\nridge = nan\n", {}, ["fit.ridge", "nan"]),
+    "negative ridge": ("[fit]\nridge = -1.0\n", {}, ["fit.ridge", "-1.0", "greater than or equal to 0"]),
+    "falling range": ("[lightings]\nintensity = [2, 1]\n", {}, ["lightings", "intensity", "lower end first"]),
+    "falling region": ("[lightings]\nregion_low = [0.5, 0, 0]\nregion_high = [0.4, 1, 1]\n", {}, ["lightings", "x runs from 0.5"]),
+    "zero lightings": ("[lightings]\ntrain = 0\n", {}, ["lightings.train", "got 0", "greater than or equal to 1"]),
+    "no kinds": ("[lightings]\nkinds = []\n", {}, ["lightings.kinds", "got []"]),
+    "a section as a number": ("fit = 3\n", {}, ["fit", "got 3"]),
+    "not TOML": ("[fit\n", {}, ["not TOML"]),
+    "unknown override": ("", {"fit.basis": "3"}, ["--fit.basis", 'did you mean "fit.bases"?']),
+    "bad override": ("", {"fit.bases": "x"}, ["--fit.bases", "got 'x'", "integer"]),
+    "override below a value": ("fit = 3\n", {"fit.bases": "3"}, ["--fit.bases"]),
+    "seed out of range": ("seed = -1\n", {}, ["seed", "got -1"]),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_each_fault_is_one_line(name: str, tmp_path: Path) -> None:
+    text, overrides, expected = FAULTS[name]
+    path = tmp_path / "job.toml"
+    path.write_text(text)
+    with pytest.raises(UserError) as caught:
+        load_config(path, overrides)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert all(part in message for part in expected), message
+    assert "job.toml" in message or "--" in message
+
+
+@pytest.mark.parametrize("name", ["nothing.toml", ""])
+def test_missing_file(name: str, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="expected a readable TOML file"):
+        load_config(tmp_path / name)
+
+
+def test_binary_file(tmp_path: Path) -> None:
+    path = tmp_path / "job.toml"
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(UserError, match="not TOML"):
+        load_config(path)
+
+
+def test_every_setting_is_described() -> None:
+    for key in keys():
+        model: type = Config
+        *parents, leaf = key.split(".")
+        for parent in parents:
+            model = model.model_fields[parent].annotation
+        assert model.model_fields[leaf].description, key

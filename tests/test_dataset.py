@@ -1,0 +1,277 @@
+"""Baking, storing, interrupting, going on, and finding damage."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ddprt
+from ddprt.config import Config
+from ddprt.dataset.generate import bake, split_lightings
+from ddprt.dataset.store import Manifest, average_into_points, expected_files, open_dataset, read_map, write_map
+from ddprt.errors import UserError
+from ddprt.progress import Progress
+from ddprt.sampling.points import Samples
+from ddprt.scene.mesh import Scene
+
+SMALL = {
+    "atlas": {"resolution": 32},
+    "lightings": {"train": 4, "validation": 2, "test": 2, "clearance": 0.05},
+    "points": {"count": 8, "supersample": 2},
+    "transport": {"samples": 16, "test_samples": 32, "direct_samples": 2},
+}
+
+
+def small(**changes: dict) -> Config:
+    return Config.model_validate({key: {**SMALL.get(key, {}), **changes.get(key, {})} for key in {*SMALL, *changes}})
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def baked(cornell: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("baked") / "dataset"
+    bake(cornell, config=small(), out=folder)
+    return folder
+
+
+def test_everything_expected_is_there(baked: Path) -> None:
+    data = open_dataset(baked)
+    assert {name for name in expected_files(data.description)} <= set(files(baked))
+    assert [len(data.split(name)) for name in ("train", "validation", "test")] == [4, 2, 2]
+    direct, indirect = data.maps("direct", range(8)), data.maps("indirect", range(8))
+    assert direct.shape == indirect.shape == (8, int(data.covered.sum()), 3)
+    assert np.isfinite(direct).all()
+    assert (direct >= 0).all()
+    assert (indirect >= 0).all()
+    assert (indirect.mean((1, 2)) > 0).all()
+    assert data.measured([0]).shape == (1, 16, 3)
+    assert not (baked / "noise" / "000000.exr").exists(), "only held-out lightings carry a noise map"
+
+
+def test_gbuffer_agrees_with_the_scene(baked: Path, cornell: Scene) -> None:
+    data = open_dataset(baked)
+    # Areas are stored as float32: each is good to eps32 / 2, and so is their sum.
+    assert data.area.sum() == pytest.approx(cornell.areas.sum(), rel=1.2e-7)
+    np.testing.assert_allclose(np.linalg.norm(data.gbuffer["geometric_normal"], axis=1), 1, atol=1e-6)
+    low, high = cornell.bounds
+    assert ((data.gbuffer["position"] >= low - 1e-6) & (data.gbuffer["position"] <= high + 1e-6)).all()
+
+
+def test_equal_seeds_give_equal_bytes_whatever_the_threads(baked: Path, cornell: Scene, tmp_path: Path) -> None:
+    bake(cornell, config=small(transport={"threads": 3}), out=tmp_path / "again")
+    one, two = files(baked), files(tmp_path / "again")
+    assert one.keys() == two.keys()
+    assert [name for name in one if one[name] != two[name]] == []
+    bake(cornell, config=small().model_copy(update={"seed": 1}), out=tmp_path / "other")
+    assert files(tmp_path / "other")["indirect/000000.exr"] != one["indirect/000000.exr"]
+
+
+@pytest.mark.parametrize("lost", ["direct/000003.exr", "measured/000001.safetensors", "indirect/000002.exr", "noise/000007.exr"])
+def test_a_lost_file_is_made_again_with_the_same_bits(lost: str, baked: Path, cornell: Scene, tmp_path: Path) -> None:
+    folder = tmp_path / "dataset"
+    shutil.copytree(baked, folder)
+    (folder / lost).unlink()
+    bake(cornell, config=small(), out=folder)
+    now, before = files(folder), files(baked)
+    assert {name: now[name] for name in now if name != "manifest.jsonl"} == {
+        name: before[name] for name in before if name != "manifest.jsonl"
+    }
+    assert Manifest(folder).damaged() == []
+
+
+def test_a_truncated_manifest_line_does_not_count(baked: Path, cornell: Scene, tmp_path: Path) -> None:
+    folder = tmp_path / "dataset"
+    shutil.copytree(baked, folder)
+    manifest = folder / "manifest.jsonl"
+    lines = manifest.read_bytes().splitlines(keepends=True)
+    manifest.write_bytes(b"".join(lines[:-3]) + lines[-3][:25])
+    assert len(Manifest(folder).entries) == len(lines) - 3
+    bake(cornell, config=small(), out=folder)
+    named = [json.loads(line)["file"] for line in manifest.read_text().splitlines()]
+    assert len(named) == len(set(named)) == len(lines), "nothing lost, nothing twice"
+
+
+INTERRUPTED = """
+import sys, ddprt
+from ddprt.config import load_config
+from ddprt.cli import main
+main(["bake", sys.argv[1], "--out", sys.argv[2]])
+"""
+
+
+def test_killed_and_interrupted_bakes_go_on(cornell: Scene, tmp_path: Path) -> None:
+    """Real signals to a real process, at three moments; the end is the same bytes as without."""
+    config = small(lightings={"train": 24}, atlas={"resolution": 64}, transport={"samples": 64, "threads": 1})
+    job = tmp_path / "job.toml"
+    job.write_text(config.to_toml())
+    bake(cornell, config=config, out=tmp_path / "whole")
+    for number, when in ((signal.SIGINT, 1), (signal.SIGKILL, 8), (signal.SIGINT, 30)):
+        process = subprocess.Popen(
+            [sys.executable, "-c", INTERRUPTED, str(job), str(tmp_path / "run")], stderr=subprocess.PIPE, text=True
+        )
+        manifest, deadline = tmp_path / "run" / "dataset" / "manifest.jsonl", time.time() + 60
+        while process.poll() is None and time.time() < deadline:
+            if manifest.exists() and manifest.read_bytes().count(b"\n") > 8 + when:
+                process.send_signal(number)
+                break
+            time.sleep(0.001)
+        _, errors = process.communicate(timeout=60)
+        if number == signal.SIGINT and process.returncode != 0:
+            assert process.returncode == 130, errors
+            assert "the same command goes on" in errors
+            assert "Traceback" not in errors
+        assert Manifest(tmp_path / "run" / "dataset").damaged() == []
+    bake(cornell, config=config, out=tmp_path / "run" / "dataset")
+    whole, resumed = files(tmp_path / "whole"), files(tmp_path / "run" / "dataset")
+    resumed = {name: data for name, data in resumed.items() if not name.rsplit("/", 1)[-1].startswith(".")}
+    assert [n for n in whole if n != "manifest.jsonl" and whole[n] != resumed.get(n)] == []
+    assert set(whole) == set(resumed)
+
+
+@pytest.mark.parametrize("damage", ["flip", "truncate", "remove"])
+def test_verify_finds_damage(damage: str, baked: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    from ddprt.cli import main
+
+    folder = tmp_path / "dataset"
+    shutil.copytree(baked, folder)
+    with pytest.raises(SystemExit) as fine:
+        main(["verify", str(folder)])
+    assert fine.value.code == 0
+    victim = folder / "indirect" / "000005.exr"
+    data = bytearray(victim.read_bytes())
+    data[len(data) // 2] ^= 1
+    {"flip": lambda: victim.write_bytes(data), "truncate": lambda: os.truncate(victim, 99), "remove": victim.unlink}[damage]()
+    with pytest.raises(SystemExit) as found:
+        main(["verify", str(folder)])
+    assert found.value.code == 2
+    assert "indirect/000005.exr" in capsys.readouterr().out
+
+
+def test_another_bake_is_never_overwritten(baked: Path, cornell: Scene, furnace: Scene, tmp_path: Path) -> None:
+    before = files(baked)
+    for scene, config in ((furnace, small(lightings={"clearance": 0.0})), (cornell, small(transport={"samples": 17}))):
+        with pytest.raises(UserError, match="holds another dataset"):
+            bake(scene, config=config, out=baked)
+    assert files(baked) == before
+    changed = tmp_path / "dataset"
+    shutil.copytree(baked, changed)
+    description = json.loads((changed / "dataset.json").read_text())
+    (changed / "dataset.json").write_text(json.dumps({**description, "schema": 99}))
+    with pytest.raises(UserError, match="got schema 99, expected 1"):
+        bake(cornell, config=small(), out=changed)
+    (changed / "dataset.json").write_text("{")
+    with pytest.raises(UserError, match="not a dataset description"):
+        open_dataset(changed)
+
+
+def test_unfinished_and_missing_datasets_are_refused(baked: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="expected a dataset"):
+        open_dataset(tmp_path / "nothing")
+    folder = tmp_path / "dataset"
+    shutil.copytree(baked, folder)
+    lines = (folder / "manifest.jsonl").read_bytes().splitlines(keepends=True)
+    (folder / "manifest.jsonl").write_bytes(b"".join(lines[:-2]))
+    with pytest.raises(UserError, match="2 files missing"):
+        open_dataset(folder)
+
+
+LAMP = {"type": "point", "position": [0.3, 0.4, 0.3], "intensity": [1, 1, 1]}
+OUTSIDE = {"type": "point", "position": [0.3, 0.4, 5.0], "intensity": [1, 1, 1]}
+IN_BLOCK = {"type": "point", "position": [0.186, 0.08, 0.169], "intensity": [1, 1, 1]}
+OFF = {**LAMP, "intensity": [0, 0, 0]}
+
+
+def lightings(*records: dict) -> list:
+    from ddprt.lights import parse_lighting
+
+    return [parse_lighting(record) for record in records]
+
+
+def test_dark_and_blocked_lightings_are_named(cornell: Scene, capsys: pytest.CaptureFixture) -> None:
+    given = {"train": lightings(LAMP, OFF, OUTSIDE, IN_BLOCK), "validation": lightings(LAMP), "test": lightings(LAMP)}
+    data = bake(cornell, given, config=small(), progress=Progress())
+    words = capsys.readouterr().err
+    assert "1 (train): lights nothing: it has no intensity" in words
+    assert "2 (train): lights nothing: it stands outside the scene" in words
+    assert "3 (train): stands inside a solid or behind a wall" in words
+    assert "0 (train)" not in words
+    assert (data.maps("indirect", [1, 2]) == 0).all()
+    model = ddprt.fit(data, bases=2)
+    assert np.isfinite(model.predict(data.values([0, 1, 2, 3], 8, "radiosity"))).all()
+
+
+@pytest.mark.parametrize("records", [(OFF, OFF, OFF), (OUTSIDE, OUTSIDE, OUTSIDE)])
+def test_all_dark_is_an_error(records: tuple, cornell: Scene, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="all 3 light nothing"):
+        bake(cornell, lightings(*records), config=small(), out=tmp_path / "dataset")
+
+
+def test_too_few_lightings_or_points(cornell: Scene, tmp_path: Path) -> None:
+    for given in ([], lightings(LAMP), {"train": lightings(LAMP), "validation": [], "test": lightings(LAMP)}):
+        with pytest.raises(UserError, match="lightings: got"):
+            bake(cornell, given, config=small(), out=tmp_path / "dataset")
+    with pytest.raises(UserError, match=r"points.count: got 600, but .* texels; lower points.count"):
+        bake(cornell, config=small(points={"count": 600}, atlas={"resolution": 24}), out=tmp_path / "many")
+    listed = tmp_path / "lights.json"
+    listed.write_text(json.dumps([[LAMP]] * 3))
+    with pytest.raises(UserError, match="got 3 lightings, expected 8"):
+        bake(cornell, config=small(lightings={"file": str(listed)}), out=tmp_path / "listed")
+
+
+def test_one_list_is_split_by_order() -> None:
+    splits = split_lightings(lightings(*[LAMP] * 20))
+    assert {name: len(rows) for name, rows in splits.items()} == {"train": 14, "validation": 2, "test": 4}
+
+
+def test_black_and_lonely_scenes_trace_no_bounce(furnace: Scene, tmp_path: Path) -> None:
+    from ddprt.scene.library import build
+
+    records = lightings(*[{**LAMP, "position": [0.1, 0.1, 0.1 * k]} for k in range(3)])
+    black = bake(build("furnace", albedo=0.0, subdivisions=2), records, config=small())
+    far = lightings(*[{**LAMP, "position": [3.0, 3.0, 1.0 + k]} for k in range(3)])
+    lonely = bake(build("convex"), far, config=small())
+    for data in (black, lonely):
+        assert (data.maps("indirect", range(3)) == 0).all()
+        assert data.description["plan"][0]["called"] is False
+
+
+def test_half_floats_keep_their_range(tmp_path: Path) -> None:
+    image = np.random.default_rng(0).random((8, 9, 3)).astype(np.float32)
+    for size in (1e-20, 1e-6, 1.0, 1e6, 1e20):
+        write_map(tmp_path / "map.exr", image * np.float32(size))
+        # Half floats round by 2^-11 of each value down to the smallest normal number, 2^-14 of the peak's power of two.
+        np.testing.assert_allclose(read_map(tmp_path / "map.exr"), image * np.float32(size), rtol=2**-11, atol=size * 2**-25)
+    write_map(tmp_path / "map.exr", np.zeros((2, 2, 3), np.float32))
+    assert (read_map(tmp_path / "map.exr") == 0).all()
+
+
+def test_supersamples_average_into_the_nearest_point() -> None:
+    position = np.array([[0.0, 0, 0], [1, 0, 0], [0.1, 0, 0], [0.9, 0, 0], [0.2, 0, 0]])
+    up = np.tile([0.0, 0, 1], (5, 1))
+    albedo = np.tile([[0.5, 1.0, 0.25]], (5, 1))
+    values = np.arange(15, dtype=np.float32).reshape(1, 5, 3)
+    samples = Samples(position, up, albedo, 0.5)
+    got = average_into_points(values, samples, 2, "irradiance")
+    np.testing.assert_allclose(got[0, 0], values[0, [0, 2, 4]].mean(0))
+    np.testing.assert_allclose(got[0, 1], values[0, [1, 3]].mean(0))
+    np.testing.assert_allclose(average_into_points(values, samples, 2, "radiosity"), got * albedo[0], rtol=1e-6)
+
+
+def test_reference_integrator_bakes_the_same_light(cornell: Scene) -> None:
+    """Operator and unbiased paths agree in the mean over texels within the paths' noise (16 x 32 x 2 per map) and bias."""
+    many = {"direct_samples": 256, "samples": 256}  # a lamp 5 cm off a wall is a hot spot within one texel of this atlas
+    by_paths = bake(cornell, config=small(transport={**many, "integrator": "reference"}))
+    by_operator = bake(cornell, config=small(transport=many))
+    weight = by_paths.area / by_paths.area.sum()
+    one, two = (np.einsum("ltc,t->lc", d.maps("indirect", range(4)), weight) for d in (by_paths, by_operator))
+    np.testing.assert_allclose(one, two, rtol=0.05)
