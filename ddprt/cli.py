@@ -280,4 +280,5 @@ def _help(name: str) -> None:
         from ddprt.config import Config
 
         print("\nsettings (in the file as [section] key = value, here as --section.key value):")
+        print("  --methods.settings.NAME '{key = value}'  settings of one method")
         tyro.cli(Config, args=["--help"], prog=f"ddprt {name} [FILE]", add_help=True)

@@ -43,7 +43,7 @@ def test_overrides_win_over_the_file() -> None:
 
 
 FAULTS = {
-    "unknown section": ('[fitt]\nbases = 3\n', {}, ["fitt", "unknown key", 'did you mean "fit"?']),
+    "unknown section": ("[fitt]\nbases = 3\n", {}, ["fitt", "unknown key", 'did you mean "fit"?']),
     "unknown key": ("[fit]\nbase = 3\n", {}, ["fit.base", "unknown key", 'did you mean "bases"?']),
     "wrong type": ('[fit]\nbases = "many"\n', {}, ["fit.bases", "got 'many'", "integer"]),
     "out of range": ("[fit]\nbases = 0\n", {}, ["fit.bases", "got 0", "greater than or equal to 1"]),
@@ -51,7 +51,11 @@ FAULTS = {
     "not finite": ("[fit]\nridge = nan\n", {}, ["fit.ridge", "nan"]),
     "negative ridge": ("[fit]\nridge = -1.0\n", {}, ["fit.ridge", "-1.0", "greater than or equal to 0"]),
     "falling range": ("[lightings]\nintensity = [2, 1]\n", {}, ["lightings", "intensity", "lower end first"]),
-    "falling region": ("[lightings]\nregion_low = [0.5, 0, 0]\nregion_high = [0.4, 1, 1]\n", {}, ["lightings", "x runs from 0.5"]),
+    "falling region": (
+        "[lightings]\nregion_low = [0.5, 0, 0]\nregion_high = [0.4, 1, 1]\n",
+        {},
+        ["lightings", "x runs from 0.5"],
+    ),
     "zero lightings": ("[lightings]\ntrain = 0\n", {}, ["lightings.train", "got 0", "greater than or equal to 1"]),
     "no kinds": ("[lightings]\nkinds = []\n", {}, ["lightings.kinds", "got []"]),
     "a section as a number": ("fit = 3\n", {}, ["fit", "got 3"]),

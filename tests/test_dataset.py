@@ -76,7 +76,9 @@ def test_equal_seeds_give_equal_bytes_whatever_the_threads(baked: Path, cornell:
     assert files(tmp_path / "other")["indirect/000000.exr"] != one["indirect/000000.exr"]
 
 
-@pytest.mark.parametrize("lost", ["direct/000003.exr", "measured/000001.safetensors", "indirect/000002.exr", "noise/000007.exr"])
+@pytest.mark.parametrize(
+    "lost", ["direct/000003.exr", "measured/000001.safetensors", "indirect/000002.exr", "noise/000007.exr"]
+)
 def test_a_lost_file_is_made_again_with_the_same_bits(lost: str, baked: Path, cornell: Scene, tmp_path: Path) -> None:
     folder = tmp_path / "dataset"
     shutil.copytree(baked, folder)

@@ -41,7 +41,13 @@ def documented_decoder() -> dict:
 @pytest.mark.parametrize("precision", ["half", "float"])
 @pytest.mark.parametrize(
     "options",
-    [{}, {"space": "gamma"}, {"centre": "mean"}, {"channels": "multi"}, {"channels": "multi", "centre": "mean", "space": "gamma"}],
+    [
+        {},
+        {"space": "gamma"},
+        {"centre": "mean"},
+        {"channels": "multi"},
+        {"channels": "multi", "centre": "mean", "space": "gamma"},
+    ],
     ids=str,
 )
 def test_decoder_reproduces_predict(options: dict, precision: str, data: Dataset, tmp_path: Path) -> None:

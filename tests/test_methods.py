@@ -173,7 +173,10 @@ def test_training_lowers_the_loss(data: Dataset) -> None:
 
 BAD = {
     "unknown method": (("svd", {}), 'no method "svd"; did you mean'),
-    "unknown setting": (("mlp", {"settings": {"widht": 3}}), 'methods.settings.mlp.widht: unknown setting; did you mean "width"?'),
+    "unknown setting": (
+        ("mlp", {"settings": {"widht": 3}}),
+        'methods.settings.mlp.widht: unknown setting; did you mean "width"?',
+    ),
     "setting out of range": (("mlp", {"settings": {"steps": 0}}), "methods.settings.mlp.steps: got 0"),
     "bases": (("svd-ridge", {"bases": 0}), "--fit.bases: got 0"),
     "ridge": (("svd-ridge", {"ridge": -1.0}), "--fit.ridge: got -1.0"),

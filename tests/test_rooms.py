@@ -67,9 +67,7 @@ def test_nothing_imports_to_its_right(path: Path) -> None:
 
 def doors(library: str) -> set[str]:
     return {
-        str(path.relative_to(PACKAGE))
-        for path in FILES
-        if any(module.split(".")[0] == library for module in imports(path))
+        str(path.relative_to(PACKAGE)) for path in FILES if any(module.split(".")[0] == library for module in imports(path))
     }
 
 

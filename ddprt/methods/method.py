@@ -156,4 +156,3 @@ def measurements(examples: Examples) -> Float[Array, "groups lightings inputs"]:
     """Measured values per transfer matrix: one group per channel for mono, one of interleaved colours for multi."""
     values = examples.frame.values
     return jnp.moveaxis(values, 2, 0) if examples.channels == "mono" else values.reshape(1, len(values), -1)
-

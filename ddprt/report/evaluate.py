@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from ddprt import seeds
@@ -101,8 +102,8 @@ def projection_error(data: Dataset, model: Model, truth: Truth, bases: int | Non
         return None
     vectors = np.asarray(basis, np.float64)[:bases]
     mono = vectors.shape[1] == len(truth.weight)
-    scale = model.encoding.scale(data.values(data.split("test"), model.points, model.quantity))
-    encoded = np.asarray(model.encoding.encode(truth.reference, scale), np.float64)
+    scale = model.encoding.scale(jnp.asarray(data.values(data.split("test"), model.points, model.quantity)))
+    encoded = np.asarray(model.encoding.encode(jnp.asarray(truth.reference), scale), np.float64)
     rows = np.moveaxis(encoded, 2, 1) if mono else encoded.reshape(len(encoded), 1, -1)
     mean = np.asarray(getattr(model.relighter, "mean", 0.0), np.float64)
     weights = entry_weights(data.area, "area", "mono" if mono else "multi").astype(np.float64)
@@ -111,7 +112,7 @@ def projection_error(data: Dataset, model: Model, truth: Truth, bases: int | Non
     coefficients = np.linalg.solve(gram, (((rows - mean) * weights) @ vectors.T).reshape(-1, len(vectors)).T).T
     light = coefficients.reshape(*rows.shape[:2], -1) @ vectors + mean
     back = np.moveaxis(light, 1, 2) if mono else light.reshape(encoded.shape)
-    decoded = np.asarray(model.encoding.decode(back.astype(np.float32), scale))
+    decoded = np.asarray(model.encoding.decode(jnp.asarray(back, jnp.float32), scale))
     return truth.relative_rmse(decoded - truth.reference)
 
 
@@ -175,7 +176,15 @@ def spot_check(scene: Scene, data: Dataset, config: Config) -> dict[str, Any]:
     noise = data.maps("noise", test)[:, texels].astype(np.float64)
     variance = np.stack([estimate.indirect_variance for estimate in estimates]) + _pooled_variance(baked, noise)
     scores = z_scores(baked, truth, variance)
-    return {**scores, "texels": count, "lightings": len(test), "baked": baked, "truth": truth, "rays": tracer.rays}
+    return {
+        **scores,
+        "texels": count,
+        "lightings": len(test),
+        "baked": baked,
+        "truth": truth,
+        "variance": variance,
+        "rays": tracer.rays,
+    }
 
 
 def _pooled_variance(baked: np.ndarray, noise: np.ndarray) -> np.ndarray:

@@ -1,0 +1,279 @@
+"""The report: one HTML file that opens from disk, with everything in it."""
+
+import base64
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ddprt import __version__
+from ddprt.config import Config
+from ddprt.dataset.store import Dataset
+from ddprt.files import write_text
+from ddprt.methods.method import STATUSES
+from ddprt.report import figures
+from ddprt.report.evaluate import Evaluation
+from ddprt.report.view import View, default_camera, take_view
+from ddprt.runtime.model import Model
+from ddprt.scene.mesh import Scene
+from ddprt.scene.unwrap import unwrap
+from ddprt.transport.effects import Effect
+from ddprt.transport.embree import Tracer
+
+# Limits past which a number becomes a warning.
+_NOISE_SHARE = 1 / 3  # noise floor over projection floor
+_MEAN_Z, _SPREAD_Z, _BIAS = 0.3, 1.5, 0.01  # of the spot check
+_NEGATIVE = 0.01  # negative energy over positive
+_BOUND = 0.01  # light left out over the largest direct irradiance
+
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_METHOD_KEYS = {
+    "relative_rmse": ("relative RMSE", "percent"),
+    "median_lighting_relative_rmse": ("median", "percent"),
+    "p90_lighting_relative_rmse": ("90th pct.", "percent"),
+    "worst_lighting_relative_rmse": ("worst", "percent"),
+    "relative_mse": ("relative MSE", "short"),
+    "psnr_db": ("PSNR (dB)", "one"),
+    "energy_bias": ("energy bias", "signed"),
+    "negative_share": ("negative light", "percent"),
+    "fit_seconds": ("fit", "seconds"),
+    "relight_seconds": ("relight", "seconds"),
+    "bytes": ("size", "bytes"),
+    "flops": ("operations", "count"),
+    "bases": ("bases", "plain"),
+    "status": ("status", "plain"),
+    "psnr_peak": ("peak (W/m²)", "short"),
+}
+
+
+def write_page(
+    path: str | Path,
+    *,
+    evaluation: Evaluation,
+    data: Dataset,
+    models: Mapping[str, Model],
+    config: Config,
+    stages: Sequence[Mapping[str, Any]] = (),
+    scene: Scene | None = None,
+    plan_effects: Sequence[Effect] | None = None,
+    command: str = "",
+) -> Path:
+    """Writes the report.
+
+    Args:
+      path: of the HTML file.
+      evaluation: what was found, from `ddprt.report.evaluate`.
+      data: the dataset it was found on.
+      models: by name of their method; the first is the one whose pictures and numbers lead.
+      config: the resolved configuration.
+      stages: of the run, each {"name", "seconds", ...facts}; "rays" is shown as a rate too.
+      scene: what was baked; without it the pictures are lightmaps alone.
+      plan_effects: the plan's effects; None takes those that the dataset was baked with.
+      command: that makes this report again.
+    Returns:
+      The path.
+    Raises:
+      UserError: the file cannot be written.
+      ValueError: no model.
+    """
+    if not models:
+        raise ValueError("got no model, expected at least one to report on")
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("ddprt", "report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    filters: tuple[Callable[..., str], ...] = (_percent, _signed, _seconds, _bytes, _count, _short, _image)
+    environment.filters |= {function.__name__.removeprefix("_"): function for function in filters}
+    effects = [Effect(**entry) for entry in data.description.get("plan", [])] if plan_effects is None else list(plan_effects)
+    main = next(iter(models))
+    page = environment.get_template("page.html.j2").render(
+        version=__version__,
+        metrics=evaluation.metrics,
+        main=main,
+        model=models[main],
+        score=evaluation.metrics["methods"][main],
+        report=models[main].relighter.report,
+        data=data,
+        config=config,
+        ratio=_ratio(evaluation, main),
+        warnings=warnings(evaluation, main, effects, data.description["scene"].get("notes", ())),
+        columns=[label for label, _ in _METHOD_KEYS.values()],
+        methods=method_table(evaluation.metrics["methods"]),
+        plots=figures.plots(evaluation, {name: model.relighter.report for name, model in models.items()}, main),
+        check=evaluation.spot_check,
+        effects=effects,
+        stages=[dict(stage) for stage in stages],
+        command=command,
+        **_pictures(evaluation, data, main, models[main], config, scene),
+    )
+    write_text(Path(path), page)
+    return Path(path)
+
+
+def warnings(
+    evaluation: Evaluation, main: str, effects: Sequence[Effect] = (), notes: Sequence[str] = ()
+) -> list[tuple[str, str]]:
+    """What a reader must know before the numbers: (title, paragraph), the gravest first."""
+    metrics, check = evaluation.metrics, evaluation.spot_check
+    scores, count = metrics["methods"], metrics["dark_test_lightings"]
+    noise, projection = (metrics["floors"][f"{key}_relative_rmse"] for key in ("noise", "projection"))
+    found = [
+        (f"{name}: {score['status']}", STATUSES.get(score["status"], "This status has no description."))
+        for name, score in scores.items()
+        if score["status"] != "ok"
+    ]
+    if noise is not None and projection is not None and noise > _NOISE_SHARE * projection:
+        text = (
+            f"The held-out maps are uncertain by {_percent(noise)}, more than a third of the projection floor "
+            f"({_percent(projection)}): part of every error is their noise. Raise transport.test_samples."
+        )
+        found.append(("Noisy references", text))
+    if check and (abs(check["mean"]) > _MEAN_Z or check["std"] > _SPREAD_Z or abs(check["relative_bias"]) > _BIAS):
+        text = (
+            f"The z-scores of baked minus traced light have mean {_signed(check['mean'], 2)} and standard deviation "
+            f"{check['std']:.2f}, and the bias is {_signed(100 * check['relative_bias'], 2)}\u00a0%; expected are 0, 1 and 0. "
+            "The bake disagrees with the unbiased integrator by more than noise. Raise transport.sender_resolution."
+        )
+        found.append(("Spot check", text))
+    if count:
+        text = (
+            f"{count} of {metrics['lightings']['test']} held-out lightings bring no indirect light. They count in pooled "
+            "errors but have no relative error of their own. Their lamps may stand inside a solid or outside the room."
+        )
+        found.append(("Dark test lightings", text))
+    if scores[main]["negative_share"] > _NEGATIVE:
+        share = _percent(scores[main]["negative_share"])
+        found.append(("Negative light", f"Before the clamp, the negative part of the prediction is {share} of the positive."))
+    for effect in effects:
+        if effect.forced or (not effect.called and (effect.bound is None or effect.bound > _BOUND)):
+            share = (
+                "an unbounded amount of" if effect.bound is None else f"at most {_percent(effect.bound)} of the largest direct"
+            )
+            found.append((f"Effect cut short: {effect.name}", f"{effect.why}; {share} irradiance is left out."))
+    return [*found, *(("Scene repaired on loading", note) for note in notes)]
+
+
+def method_table(methods: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, list[str]]]:
+    """Rows of (name, cells in the order of the columns), best first."""
+    order = sorted(methods, key=lambda name: (methods[name]["relative_rmse"] is None, methods[name]["relative_rmse"] or 0))
+    forms: dict[str, Callable[[Any], str]] = {"percent": _percent, "short": _short, "seconds": _seconds}
+    forms |= {
+        "bytes": _bytes,
+        "count": _count,
+        "plain": str,
+        "one": lambda value: f"{value:.1f}",
+        "signed": lambda value: _signed(100 * value, 2) + "\u00a0%",
+    }
+    rows = []
+    for name in order:
+        cells = [(methods[name].get(key), forms[form]) for key, (_, form) in _METHOD_KEYS.items()]
+        rows.append((name, ["–" if value is None else form(value) for value, form in cells]))
+    return rows
+
+
+def _pictures(
+    evaluation: Evaluation, data: Dataset, main: str, model: Model, config: Config, scene: Scene | None
+) -> dict[str, Any]:
+    view, tracer = None, None
+    if scene is not None:
+        atlas = data.description["atlas"]
+        tracer = Tracer.of(scene, config.transport.threads)
+        uv, _ = unwrap(scene, atlas["resolution"], atlas["padding"])
+        view = take_view(tracer, uv, data.covered, default_camera(scene))
+    truth, predicted, test = evaluation.truth, evaluation.predicted[main], data.split("test")
+    errors, albedo, rows = truth.errors_per_lighting(predicted), data.gbuffer["albedo"], []
+    for row, label in figures.choose_rows(errors, config.report.rows):
+        direct, reference = data.maps("direct", [test[row]])[0], truth.reference[row]
+        pictures = figures.lighting_row(direct, predicted[row], reference, albedo, data.covered, view)
+        mean = float(np.average(reference.mean(1), weights=truth.weight))
+        distance = float(evaluation.distance[row]) if len(evaluation.distance) else np.nan
+        lamps = [light.anchor() for light in data.lightings[test[row]]]
+        facts = {
+            "index": test[row],
+            "label": label,
+            "error": float(errors[row]),
+            "share": pictures["limit"] / mean,
+            "mean": mean,
+        }
+        facts |= {"distance": distance if np.isfinite(distance) else None, "kinds": _kinds(data, test[row])}
+        rows.append({**pictures, **facts, "lamps": _lamps(view, lamps)})
+    basis = getattr(model.relighter, "basis", None)
+    bases = [] if basis is None else figures.basis_pictures(np.asarray(basis), data.covered, view)
+    points: tuple[bytes, ...] = ()
+    if view is not None and tracer is not None:
+        points = figures.points_pictures(data, model.points, tracer, view, truth.reference.mean(0))
+    aspect = view.camera.aspect if view else 1.0
+    return {"rows": rows, "basis_pictures": bases, "points_pictures": points, "aspect": aspect}
+
+
+def _lamps(view: View | None, lamps: Sequence[np.ndarray | None]) -> list[tuple[float, float]]:
+    """Places of the lamps in the view's picture, percent from left and top."""
+    placed = [lamp for lamp in lamps if lamp is not None]
+    if view is None or not placed:
+        return []
+    places = view.camera.project(np.array(placed, np.float64))
+    return [(float(100 * x), float(100 * y)) for x, y in places if 0 <= x <= 1 and 0 <= y <= 1]
+
+
+def _kinds(data: Dataset, index: int) -> str:
+    kinds = [light.kind for light in data.lightings[index]]
+    return ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
+
+
+def _ratio(evaluation: Evaluation, main: str) -> float | None:
+    error, floor = (
+        evaluation.metrics["methods"][main]["relative_rmse"],
+        evaluation.metrics["floors"]["projection_relative_rmse"],
+    )
+    return error / floor if error is not None and floor else None
+
+
+def _percent(value: float | int | None) -> str:
+    if value is None:
+        return "–"
+    size = abs(100 * value)
+    return f"{100 * value:.{0 if size >= 99.5 else 1 if size >= 9.95 else 2}f}\u00a0%"
+
+
+def _signed(value: float | int, digits: int) -> str:
+    return f"{value:+.{digits}f}".replace("-", "−")
+
+
+def _seconds(value: float | int) -> str:
+    for unit, scale in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
+        if value >= 0.9995 * scale:
+            return f"{value / scale:.3g} {unit}"
+    return "0 s" if value == 0 else f"{value * 1e9:.0f} ns"
+
+
+def _bytes(value: float | int) -> str:
+    for unit, scale in (("GiB", 2**30), ("MiB", 2**20), ("KiB", 2**10)):
+        if value >= scale:
+            return f"{value / scale:.1f} {unit}"
+    return f"{value:.0f} B"
+
+
+def _count(value: float | int) -> str:
+    for unit, scale in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
+        if value >= scale:
+            return f"{value / scale:.3g} {unit}"
+    return f"{value:.0f}"
+
+
+def _short(value: Any) -> str:
+    """Three digits; large and small numbers as 1.2·10⁻⁶."""
+    if not isinstance(value, float):
+        return str(value)
+    digits, _, power = f"{value:.3g}".partition("e")
+    return f"{digits}·10{str(int(power)).translate(_SUPERSCRIPT)}" if power else digits
+
+
+def _image(picture: bytes) -> str:
+    """The address of a picture that stands in the page itself."""
+    return "data:image/png;base64," + base64.b64encode(picture).decode()

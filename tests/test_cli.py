@@ -1,0 +1,243 @@
+"""The command line: exit codes, one-line errors, files where they are promised."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ddprt.cli import LATER, VERBS, main
+from ddprt.config import load_config
+from ddprt.scene.exr import read_exr
+
+SMALL = """
+[scene]
+name = "cornell"
+[atlas]
+resolution = 32
+[lightings]
+train = 6
+validation = 2
+test = 3
+[points]
+count = 8
+supersample = 2
+[transport]
+samples = 16
+test_samples = 32
+[fit]
+bases = 3
+[methods]
+compare = ["svd-ridge", "mean"]
+[report]
+rows = 1
+bases_curve = [1, 2, 3]
+spot_check_texels = 16
+spot_check_lightings = 1
+spot_check_samples = 16
+"""
+
+
+def call(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as stop:
+        main([str(argument) for argument in arguments])
+    return int(stop.value.code or 0)
+
+
+@pytest.fixture(scope="module")
+def job(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("job") / "job.toml"
+    path.write_text(SMALL)
+    return path
+
+
+@pytest.fixture(scope="module")
+def done(job: Path) -> Path:
+    assert call("run", job, "--out", job.parent / "run", "--quiet") == 0
+    return job.parent / "run"
+
+
+def test_run_leaves_what_is_promised(done: Path, job: Path) -> None:
+    names = {path.name for path in done.iterdir()}
+    assert names == {"config.toml", "run.json", "dataset", "model.ddprt", "metrics.json", "report.html", "export"}
+    assert load_config(done / "config.toml") == load_config(job)
+    metrics = json.loads((done / "metrics.json").read_text())
+    assert metrics["schema"] == 1
+    assert metrics["lightings"] == {"train": 6, "validation": 2, "test": 3}
+    assert set(metrics["methods"]) == {"svd-ridge", "mean"}
+    keys = "relative_rmse relative_mse psnr_db energy_bias median_lighting_relative_rmse p90_lighting_relative_rmse"
+    keys += " worst_lighting_relative_rmse fit_seconds relight_seconds bytes bases status"
+    assert set(keys.split()) <= set(metrics["methods"]["svd-ridge"])
+    assert set(metrics["floors"]) == {"noise_relative_rmse", "projection_relative_rmse", "mean_relative_rmse"}
+    assert set(metrics["numerics"]) == {"measurement_condition", "numerical_rank", "ridge", "ridge_chosen_by"}
+    assert metrics["floors"]["projection_relative_rmse"] <= metrics["methods"]["svd-ridge"]["relative_rmse"]
+    run = json.loads((done / "run.json").read_text())
+    assert {"stages", "effects", "seed", "machine", "seconds"} <= set(run)
+    bounces = run["effects"][0]
+    assert bounces["name"] == "diffuse bounces"
+    assert bounces["called"]
+    assert bounces["rays"] > 0
+    assert 0 < bounces["energy_share"] < 1
+    assert sum(effect["energy_share"] for effect in run["effects"]) == pytest.approx(1)
+    assert [effect["rays"] for effect in run["effects"] if not effect["called"]] == [0] * 4
+
+
+def test_resolved_configuration_runs_again_without_baking(done: Path, capfd: pytest.CaptureFixture) -> None:
+    before = {path: path.stat().st_mtime_ns for path in (done / "dataset").rglob("*") if path.is_file()}
+    assert call("run", done / "config.toml") == 0
+    assert {path: path.stat().st_mtime_ns for path in (done / "dataset").rglob("*") if path.is_file()} == before
+    out = capfd.readouterr().out
+    for name in ("report.html", "model.ddprt", "metrics.json", "export"):
+        assert str(done / name) in out
+
+
+def test_each_step_on_its_own(job: Path, tmp_path: Path) -> None:
+    for verb in ("bake", "fit", "eval", "export"):
+        assert call(verb, job, "--out", tmp_path / "run", "--quiet") == 0
+    assert (tmp_path / "run" / "report.html").stat().st_size > 1000
+    assert (tmp_path / "run" / "export" / "manifest.json").exists()
+    assert call("verify", tmp_path / "run") == 0
+
+
+def test_relight(done: Path, tmp_path: Path) -> None:
+    lamp = {"type": "point", "position": [0.3, 0.4, 0.3], "intensity": [1, 1, 1]}
+    assert call("relight", done / "model.ddprt", "--lighting", json.dumps([lamp]), "--out", tmp_path / "one.exr") == 0
+    one = read_exr(tmp_path / "one.exr")[0]
+    assert one.shape == (32, 32, 3)
+    assert one.max() > 0
+    (tmp_path / "two.json").write_text(json.dumps([[lamp], [{**lamp, "intensity": [2, 2, 2]}]]))
+    assert call("relight", done / "model.ddprt", "--lighting", tmp_path / "two.json", "--out", tmp_path / "two.exr") == 0
+    first, second = (read_exr(tmp_path / f"two_00{k}.exr")[0] for k in (0, 1))
+    np.testing.assert_array_equal(first, one)
+    np.testing.assert_allclose(second, 2 * one, rtol=1e-5, atol=1e-5 * one.max())
+
+
+def test_inspect_and_doctor(capsys: pytest.CaptureFixture) -> None:
+    assert call("inspect", "cornell", "--atlas.resolution", "64") == 0
+    text = capsys.readouterr().out
+    assert "30 triangles" in text
+    assert "diffuse bounces: called for" in text
+    assert "spot lights: left out" in text
+    assert call("doctor") == 0
+    assert "BROKEN" not in capsys.readouterr().out
+
+
+FAULTS = {
+    "unknown verb": (["rnu"], 'no verb "rnu"; did you mean "run"?'),
+    "later verb": (["view", "x"], "not built yet"),
+    "no file": (["run"], "got 0 files, expected a configuration"),
+    "missing file": (["run", "nothing.toml"], "expected a readable TOML file"),
+    "unknown option": (["run", "{job}", "--otu", "x"], '--otu: unknown option; did you mean "out"?'),
+    "option without value": (["run", "{job}", "--fit.bases"], "--fit.bases: got no value"),
+    "unknown setting": (["run", "{job}", "--fit.basis", "3"], 'did you mean "fit.bases"?'),
+    "wrong type": (["run", "{job}", "--fit.bases=x"], "--fit.bases: got 'x', expected integer"),
+    "zero lightings": (["run", "{job}", "--lightings.train", "0"], "--lightings.train: got 0"),
+    "unknown scene": (["run", "{job}", "--scene.name", "cornel"], 'did you mean "cornell"?'),
+    "missing mesh": (["run", "{job}", "--scene.name", "room.glb"], "room.glb"),
+    "unknown method": (["run", "{job}", "--fit.method", "svd"], 'no method "svd"'),
+    "unknown method setting": (["run", "{job}", "--methods.settings.mlp", "{{stepz = 3}}"], 'did you mean "steps"?'),
+    "too many points": (["run", "{job}", "--points.count", "60000"], "points.count: got 60000"),
+    "too small an atlas": (["run", "{job}", "--atlas.resolution", "8"], "atlas.resolution: got 8"),
+    "no free place": (["run", "{job}", "--lightings.clearance", "9"], "got no free position"),
+    "folder in the way": (["run", "{job}", "--out", "{job}/below"], "cannot be made"),
+    "fit without a bake": (["fit", "{job}", "--out", "{tmp}/none"], "got no dataset, expected a run folder"),
+    "export without a model": (["export", "{job}", "--out", "{tmp}/none"], "expected a model folder"),
+    "fit of another scene": (["fit", "{job}", "--out", "{run}", "--scene.name", "furnace"], 'got a dataset of scene "cornell"'),
+    "bake over another": (["bake", "{job}", "--out", "{run}", "--seed", "7"], "holds another dataset"),
+    "relight without a lighting": (["relight", "{run}/model.ddprt"], "got no --lighting"),
+    "relight with a bad light": (
+        ["relight", "{run}/model.ddprt", "--lighting", '[{{"type": "pint"}}]'],
+        'did you mean "point"?',
+    ),
+    "relight to a PNG": (["relight", "{run}/model.ddprt", "--lighting", "[]", "--out", "a.png"], "ends in .exr"),
+    "verify nothing": (["verify", "{tmp}/none"], "expected a dataset"),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_each_fault_is_one_line_and_exit_code_2(
+    name: str, job: Path, done: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words, expected = FAULTS[name]
+    before = {path: path.read_bytes() for path in done.rglob("*") if path.is_file()}
+    assert call(*[word.format(job=job, run=done, tmp=tmp_path) for word in words]) == 2
+    error = capsys.readouterr().err
+    lines = [line for line in error.splitlines() if line.startswith("ddprt: ")]
+    assert len(lines) == 1, error
+    assert expected in lines[0]
+    assert "Traceback" not in error
+    assert {path: path.read_bytes() for path in done.rglob("*") if path.is_file()} == before, "earlier results are untouched"
+
+
+def test_our_own_fault_is_exit_code_1(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    import ddprt.pipeline_inspect as inspection
+
+    monkeypatch.setattr(inspection, "checkup", lambda: 1 / 0)
+    assert call("doctor") == 1
+    assert "this is our fault" in capsys.readouterr().err
+    with pytest.raises(ZeroDivisionError):
+        main(["doctor", "--debug"])
+
+
+def test_embreex_missing_is_said_plainly(tmp_path: Path) -> None:
+    (tmp_path / "embreex").mkdir()
+    (tmp_path / "embreex" / "__init__.py").write_text("raise ImportError('no embree here')")
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    answer = subprocess.run(
+        [sys.executable, "-m", "ddprt", "inspect", "cornell"], capture_output=True, text=True, env=environment, check=False
+    )
+    assert answer.returncode == 2
+    assert answer.stderr.count("\n") == 1
+    assert "embreex" in answer.stderr
+    assert "pip install embreex" in answer.stderr
+
+
+def test_help_is_whole_and_instant() -> None:
+    """No timing here: what must not be imported is what would make it slow."""
+    code = "import sys; from ddprt.cli import main\ntry: main(['--help'])\nexcept SystemExit: print(sorted(sys.modules))"
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert all(verb in answer.stdout for verb in VERBS)
+    assert not LATER & set(VERBS)
+    loaded = answer.stdout.rsplit("[", 1)[1]
+    assert not any(f"'{name}'" in loaded for name in ("jax", "numpy", "pydantic", "tyro", "rich"))
+
+
+def test_verb_help_lists_every_setting(capsys: pytest.CaptureFixture) -> None:
+    from ddprt.config import keys
+
+    assert call("run", "--help") == 0
+    text = capsys.readouterr().out
+    assert "--out" in text
+    squeezed = "".join(text.split())
+    assert [key for key in keys() if f"--{key.replace('_', '-')}" not in squeezed and f"--{key}" not in squeezed] == []
+
+
+def test_more_bases_than_rank_is_a_warning(job: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    assert call("bake", job, "--out", tmp_path / "run", "--quiet") == 0
+    assert call("fit", job, "--out", tmp_path / "run", "--fit.bases", "100") == 0
+    assert "warning: fit.bases: asked for 100, the data has rank 18: 18 are given" in capsys.readouterr().err
+
+
+def test_heartbeat_without_a_terminal(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    from ddprt.progress import Progress
+
+    clock = iter(range(0, 1000, 6))
+    monkeypatch.setattr(time, "perf_counter", lambda: float(next(clock)))
+    progress = Progress()
+    with progress.stage("baking", 4) as stage:
+        for _ in range(4):
+            stage.advance()
+    lines = capsys.readouterr().err.splitlines()
+    assert any("baking: 2 of 4" in line and "s left" in line for line in lines)
+    assert progress.stages[0]["name"] == "baking"
+
+
+def test_configuration_of_a_run_is_plain_toml(done: Path) -> None:
+    document = tomllib.loads((done / "config.toml").read_text())
+    assert document["fit"]["bases"] == 3

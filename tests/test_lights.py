@@ -1,0 +1,308 @@
+"""Lights: closed forms, laws, JSON, and records that are refused."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from oracles import above_horizon, polygon_irradiance
+from pydantic import ValidationError
+
+from ddprt.errors import UserError
+from ddprt.lights import LIGHTS, Light, lighting_json, load_lightings, parse_lighting
+
+RECORDS: dict[str, dict[str, Any]] = {
+    "point": {"type": "point", "position": [0.3, 1.2, -0.4], "intensity": [1.0, 2.0, 0.5]},
+    "spot": {
+        "type": "spot",
+        "position": [0.3, 1.2, -0.4],
+        "direction": [0.1, -2.0, 0.3],
+        "intensity": [1.0, 2.0, 0.5],
+        "inner_deg": 20.0,
+        "outer_deg": 35.0,
+    },
+    "directional": {"type": "directional", "direction": [0.5, -1.0, 0.2], "irradiance": [3.0, 2.0, 1.0]},
+    "rect": {
+        "type": "rect",
+        "center": [0.3, 1.2, -0.4],
+        "half_u": [0.4, 0.0, 0.1],
+        "half_v": [0.0, 0.1, 0.3],
+        "radiance": [1.0, 2.0, 0.5],
+    },
+    "sphere": {"type": "sphere", "center": [0.3, 1.2, -0.4], "radius": 0.2, "radiance": [1.0, 2.0, 0.5]},
+}
+UP = np.array([0.0, 1.0, 0.0])
+
+
+def light(record: dict[str, Any], **changes: Any) -> Light:
+    return parse_lighting({**record, **changes})[0]
+
+
+def sampled(lamp: Light, point: np.ndarray, normal: np.ndarray, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Mean irradiance at a point and its standard error."""
+    u = np.random.default_rng(seed).random((count, 2))
+    sample = lamp.illuminate(np.broadcast_to(point, (count, 3)).astype(np.float64), u)
+    values = sample.irradiance * np.maximum(sample.direction @ normal, 0)[:, None]
+    return values.mean(0), values.std(0) / np.sqrt(count)
+
+
+# --- closed forms -----------------------------------------------------------------------------------------------------
+
+
+def test_point_light_falls_with_the_square() -> None:
+    lamp = light(RECORDS["point"])
+    points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
+    away = np.array(RECORDS["point"]["position"]) - points
+    r = np.linalg.norm(away, axis=1)
+    sample = lamp.illuminate(points, np.zeros((50, 2)))
+    np.testing.assert_allclose(sample.irradiance, np.array([1.0, 2.0, 0.5]) / r[:, None] ** 2, rtol=1e-14)
+    np.testing.assert_allclose(sample.direction, away / r[:, None], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(sample.distance, r, rtol=1e-14)
+    mean, _ = sampled(lamp, np.zeros(3), UP, 1)
+    distance = np.linalg.norm(RECORDS["point"]["position"])
+    np.testing.assert_allclose(mean, np.array([1, 2, 0.5]) * (1.2 / distance) / distance**2, rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("angle", "share"),
+    [
+        (0.0, 1.0),
+        (19.999, 1.0),
+        # glTF: clamp((cos a - cos outer) / (cos inner - cos outer))²
+        (25.0, ((np.cos(np.radians(25)) - np.cos(np.radians(35))) / (np.cos(np.radians(20)) - np.cos(np.radians(35)))) ** 2),
+        (30.0, ((np.cos(np.radians(30)) - np.cos(np.radians(35))) / (np.cos(np.radians(20)) - np.cos(np.radians(35)))) ** 2),
+        (35.001, 0.0),
+        (90.0, 0.0),
+        (180.0, 0.0),
+    ],
+)
+def test_spot_falls_off_as_in_gltf(angle: float, share: float) -> None:
+    lamp = light(RECORDS["spot"], position=[0, 0, 0], direction=[0, 0, -3], intensity=[2, 2, 2])
+    point = 4 * np.array([[np.sin(np.radians(angle)), 0, -np.cos(np.radians(angle))]])
+    irradiance = lamp.illuminate(point, np.zeros((1, 2))).irradiance
+    np.testing.assert_allclose(irradiance, np.full((1, 3), 2 / 16 * share), rtol=1e-12, atol=1e-15)
+
+
+def test_spot_angles_are_half_angles_about_any_axis() -> None:
+    lamp = light(RECORDS["spot"])
+    axis = np.array(RECORDS["spot"]["direction"]) / np.linalg.norm(RECORDS["spot"]["direction"])
+    directions = np.random.default_rng(0).normal(size=(20_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    lit = lamp.illuminate(np.array(RECORDS["spot"]["position"]) + directions, np.zeros((20_000, 2))).irradiance.any(1)
+    np.testing.assert_array_equal(lit, directions @ axis > np.cos(np.radians(35)))
+
+
+def test_directional_light_is_given_on_a_plane_that_faces_it() -> None:
+    lamp = light(RECORDS["directional"])
+    sample = lamp.illuminate(np.random.default_rng(0).normal(size=(5, 3)), np.zeros((5, 2)))
+    towards = -np.array([0.5, -1.0, 0.2]) / np.linalg.norm([0.5, -1.0, 0.2])
+    np.testing.assert_allclose(sample.direction, np.tile(towards, (5, 1)), rtol=1e-15)
+    np.testing.assert_array_equal(sample.irradiance, np.tile([3.0, 2.0, 1.0], (5, 1)))
+    assert np.isinf(sample.distance).all()
+    mean, _ = sampled(lamp, np.zeros(3), UP, 1)
+    np.testing.assert_allclose(mean, np.array([3, 2, 1]) * towards[1], rtol=1e-14)
+
+
+RECTS = {
+    "ceiling": ([0.1, 2.0, -0.2], [0.7, 0.0, 0.0], [0.0, 0.0, 0.4]),
+    "slanted parallelogram": ([0.5, 1.5, 0.3], [0.3, -0.2, 0.1], [0.2, 0.1, 0.6]),
+    "close": ([0.0, 0.15, 0.0], [0.5, 0.0, 0.0], [0.0, 0.0, 0.5]),
+    "half below the horizon": ([0.8, 0.1, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, 0.5]),
+}
+
+
+@pytest.mark.parametrize("name", RECTS)
+def test_rectangle_light_meets_lamberts_formula(name: str) -> None:
+    center, half_u, half_v = (np.array(vector) for vector in RECTS[name])
+    if np.cross(half_u, half_v) @ center > 0:  # turn the front to the origin
+        half_u = -half_u
+    corners = np.array([center + a * half_u + b * half_v for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
+    expected = polygon_irradiance(above_horizon(corners, np.zeros(3), UP), 3.0, np.zeros(3), UP)
+    lamp = light(RECORDS["rect"], center=center.tolist(), half_u=half_u.tolist(), half_v=half_v.tolist(), radiance=[3, 3, 3])
+    mean, error = sampled(lamp, np.zeros(3), UP, 1 << 18)
+    assert 0 < error[0] < 0.01 * expected
+    assert abs(mean[0] - expected) < 4 * error[0]
+    back = light(RECORDS["rect"], center=center.tolist(), half_u=half_v.tolist(), half_v=half_u.tolist(), radiance=[3, 3, 3])
+    assert not sampled(back, np.zeros(3), UP, 1000)[0].any()
+
+
+@pytest.mark.parametrize(
+    ("center", "radius"), [((0.0, 2.0, 0.0), 0.5), ((0.5, 1.0, -0.3), 0.9), ((0.0, 1.0, 0.0), 0.999), ((30.0, 40.0, 0.0), 1e-3)]
+)
+def test_sphere_light_has_a_closed_form(center: tuple[float, float, float], radius: float) -> None:
+    """E = pi L sin² cos(theta) for a ball wholly above the horizon: that of a disk of the same outline."""
+    distance = np.linalg.norm(center)
+    expected = np.pi * 3 * (radius / distance) ** 2 * center[1] / distance
+    mean, error = sampled(light(RECORDS["sphere"], center=center, radius=radius, radiance=[3, 3, 3]), np.zeros(3), UP, 1 << 16)
+    # Every sample of a far ball has nearly the same cosine: rounding (1e-13 of it) then outweighs the standard error.
+    assert abs(mean[0] - expected) < 4 * error[0] + 1e-12 * expected
+
+
+def test_far_spheres_keep_their_precision_in_float32() -> None:
+    lamp = light(RECORDS["sphere"], center=[0, 1000, 0], radius=0.1, radiance=[1, 1, 1])
+    sample = lamp.illuminate(np.zeros((4, 3), np.float32), np.random.default_rng(0).random((4, 2), np.float32))
+    assert sample.irradiance.dtype == sample.direction.dtype == sample.distance.dtype == np.float32
+    np.testing.assert_allclose(sample.irradiance, np.pi * 1e-8, rtol=1e-6)  # ten roundings of 6e-8
+    np.testing.assert_allclose(sample.direction[:, 1], 1, atol=1e-6)
+
+
+def test_shadow_rays_reach_the_near_side_of_a_sphere() -> None:
+    u = np.random.default_rng(0).random((1000, 2))
+    sample = light(RECORDS["sphere"], center=[0, 2, 0], radius=0.5).illuminate(np.zeros((1000, 3)), u)
+    hit = sample.direction * sample.distance[:, None]
+    np.testing.assert_allclose(np.linalg.norm(hit - [0, 2, 0], axis=1), 0.5, rtol=1e-6)  # a root near 0 halves the digits
+    assert (hit[:, 1] < 2).all()
+
+
+def test_a_sphere_lights_nothing_inside_itself() -> None:
+    points = np.array([[0.3, 1.2, -0.4], [0.35, 1.2, -0.4], [0.3, 1.399, -0.4]])
+    sample = light(RECORDS["sphere"]).illuminate(points, np.full((3, 2), 0.3))
+    assert not sample.irradiance.any()
+
+
+# --- laws of every light ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", LIGHTS)
+def test_every_light_does_its_duty(kind: str) -> None:
+    lamp = light(RECORDS[kind])
+    assert isinstance(lamp, Light)
+    assert lamp.kind == kind == RECORDS[kind]["type"]
+    assert lamp.delta is (kind in ("point", "spot", "directional"))
+    place = RECORDS[kind].get("position", RECORDS[kind].get("center"))
+    np.testing.assert_array_equal(lamp.anchor(), place)
+    with pytest.raises(ValidationError):
+        lamp.type = "other"
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("kind", LIGHTS)
+def test_directions_are_unit_and_nothing_is_negative(kind: str, dtype: type) -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-2, 2, (500, 3)).astype(dtype)
+    sample = light(RECORDS[kind]).illuminate(points, rng.random((500, 2)).astype(dtype))
+    assert sample.irradiance.dtype == sample.direction.dtype == sample.distance.dtype == dtype
+    np.testing.assert_allclose(np.linalg.norm(sample.direction, axis=1), 1, atol=8 * np.finfo(dtype).eps)
+    assert (sample.irradiance >= 0).all()
+    assert (sample.distance >= 0).all()
+    assert sample.irradiance.any()
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("kind", LIGHTS)
+def test_points_on_the_light_stay_finite(kind: str, dtype: type) -> None:
+    lamp = light(RECORDS[kind])
+    anchor = lamp.anchor()
+    place = np.zeros(3) if anchor is None else anchor
+    points = np.stack([place, place + [1e-20, 0, 0], place + [0.2, 0, 0], place * (1 + 1e-7)]).astype(dtype)
+    for u in (0.0, 0.5, 0.999):
+        sample = lamp.illuminate(points, np.full((4, 2), u, dtype))
+        assert np.isfinite(sample.irradiance).all()
+        assert np.isfinite(sample.direction).all()
+
+
+@pytest.mark.parametrize("kind", LIGHTS)
+def test_moving_lamp_and_points_together_changes_nothing(kind: str) -> None:
+    rng = np.random.default_rng(1)
+    points, u, offset = rng.uniform(-1, 1, (40, 3)), rng.random((40, 2)), np.array([0.5, -3.0, 8.0])
+    here = light(RECORDS[kind]).illuminate(points, u)
+    there = light(RECORDS[kind]).translated(offset).illuminate(points + offset, u)
+    # Coordinates near 10 carry 2e-15; the square of a distance of some 0.5 m magnifies it a few times.
+    np.testing.assert_allclose(there.irradiance, here.irradiance, rtol=1e-12)
+    np.testing.assert_allclose(there.direction, here.direction, atol=1e-13)
+    np.testing.assert_allclose(there.distance, here.distance, rtol=1e-12)
+
+
+@pytest.mark.parametrize("kind", LIGHTS)
+def test_scaled_light_scales(kind: str) -> None:
+    rng = np.random.default_rng(1)
+    points, u = rng.uniform(-1, 1, (40, 3)), rng.random((40, 2))
+    once, twice = (light(RECORDS[kind]).scaled(factor).illuminate(points, u) for factor in (1.0, 2.0))
+    np.testing.assert_array_equal(twice.irradiance, 2 * once.irradiance)
+    np.testing.assert_array_equal(twice.direction, once.direction)
+    assert not light(RECORDS[kind]).scaled(0.0).illuminate(points, u).irradiance.any()
+
+
+# --- JSON -------------------------------------------------------------------------------------------------------------
+
+
+def test_json_there_and_back(tmp_path: Path) -> None:
+    lighting = parse_lighting(list(RECORDS.values()))
+    text = json.dumps(lighting_json(lighting))
+    assert parse_lighting(json.loads(text)) == lighting
+    assert [record["type"] for record in json.loads(text)] == list(RECORDS)
+    (tmp_path / "lightings.json").write_text(json.dumps([lighting_json(lighting), lighting_json(lighting[:1]), []]))
+    assert load_lightings(tmp_path / "lightings.json") == [lighting, lighting[:1], ()]
+
+
+def test_lights_records_and_lists_are_taken_alike() -> None:
+    record = RECORDS["point"]
+    lamp = light(record)
+    assert parse_lighting(record) == parse_lighting([record]) == parse_lighting(lamp) == parse_lighting((lamp,)) == (lamp,)
+    assert parse_lighting([lamp, record]) == (lamp, lamp)
+    assert parse_lighting([]) == ()
+
+
+def without(kind: str, key: str) -> dict[str, Any]:
+    return {name: value for name, value in RECORDS[kind].items() if name != key}
+
+
+BAD: list[tuple[Any, str]] = [
+    ({**RECORDS["point"], "type": "pont"}, r'\[0\]\.type: got .pont., expected one of .*did you mean "point"'),
+    ({**RECORDS["point"], "type": ["point"]}, r"\[0\]\.type: got \[.point.\], expected one of"),
+    (without("point", "type"), r"\[0\]\.type: got None, expected one of directional, point, rect, sphere, spot"),
+    (without("point", "intensity"), "intensity: Field required"),
+    (without("rect", "half_v"), "half_v: Field required"),
+    ({**RECORDS["point"], "colour": [1, 1, 1]}, "colour: got .*not permitted"),
+    ({**RECORDS["point"], "intensity": [1, -1, 1]}, r"intensity\.1: got -1, .*greater than or equal to 0"),
+    ({**RECORDS["sphere"], "radiance": [1, float("nan"), 1]}, r"radiance\.1: got nan, .*finite"),
+    ({**RECORDS["directional"], "irradiance": [1, 1, float("inf")]}, r"irradiance\.2: got inf, .*finite"),
+    ({**RECORDS["point"], "position": [0, float("nan"), 0]}, r"position\.1: got nan, .*finite"),
+    ({**RECORDS["point"], "position": [0, 0]}, "position"),
+    ({**RECORDS["point"], "position": [0, 0, 0, 0]}, "position"),
+    ({**RECORDS["point"], "position": "here"}, "position: got 'here'"),
+    ({**RECORDS["directional"], "direction": [0, 0, 0]}, "direction: got a vector of length 0, expected a direction"),
+    ({**RECORDS["spot"], "direction": [0, 0, 0]}, "direction: got a vector of length 0, expected a direction"),
+    ({**RECORDS["spot"], "inner_deg": 40}, r"inner_deg: got 40.0, expected less than outer_deg \(35.0\)"),
+    ({**RECORDS["spot"], "outer_deg": 91}, "outer_deg: got 91"),
+    ({**RECORDS["rect"], "half_u": [0, 0, 0]}, "half_u: got a vector of length 0"),
+    ({**RECORDS["rect"], "half_u": [0, 0.2, 0.6]}, "got parallel vectors, expected a rectangle with area"),
+    ({**RECORDS["sphere"], "radius": 0}, "radius: got 0, .*greater than 0"),
+    ({**RECORDS["sphere"], "radius": -1}, "radius: got -1"),
+    ("point", "got str, expected a light or a list of lights"),
+    (None, "got NoneType"),
+    (7, "got int"),
+    ([RECORDS["point"], 5], r"lighting\.1: got 5"),
+    ([RECORDS["point"], {**RECORDS["point"], "type": "bulb"}], r"lighting\[1\]\.type"),
+]
+
+
+@pytest.mark.parametrize(("records", "message"), BAD)
+def test_bad_records_get_one_line(records: Any, message: str) -> None:
+    with pytest.raises(UserError, match=message) as caught:
+        parse_lighting(records)
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith("lighting")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "got No such file or directory, expected a readable JSON list"),
+        ("", "not JSON"),
+        ("[[{", "not JSON"),
+        (b"\xff\xfe\x00", "not JSON"),
+        ("[]", "got an empty list, expected lightings"),
+        ("{}", "got dict, expected lightings"),
+        ('[[{"type": "lamp"}]]', r"lightings\.json\[0\]\[0\]\.type: got 'lamp'"),
+        ('[[], [{"type": "point", "position": [0, 0, NaN], "intensity": [1, 1, 1]}]]', r"json\[1\].*position\.2: got nan"),
+    ],
+)
+def test_bad_files_get_one_line(tmp_path: Path, content: str | bytes | None, message: str) -> None:
+    path = tmp_path / "lightings.json"
+    if content is not None:
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
+    with pytest.raises(UserError, match=message) as caught:
+        load_lightings(path)
+    assert "\n" not in str(caught.value)
