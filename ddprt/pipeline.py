@@ -100,6 +100,7 @@ class Run:
         if report.status != "ok":
             self.progress.say(f"warning: {names[0]}: {report.status}: {STATUSES[report.status]}")
         main.save(self.folder / "model.ddprt")
+        write_text(self.folder / "config.toml", self.config.to_toml())
         return models, seconds
 
     def evaluate(self, data: Dataset, models: dict[str, Any], seconds: dict[str, float]) -> Any:
@@ -185,7 +186,7 @@ class Run:
             "effects": _effects(self.effects(data), stages, data),
             "machine": machine(),
         }
-        write_text(self.folder / "run.json", json.dumps(document, indent=1) + "\n")
+        write_text(self.folder / "run.json", json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
 def _effects(effects: Plan, stages: list[dict[str, Any]], data: Dataset) -> list[dict[str, Any]]:

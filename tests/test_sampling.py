@@ -83,8 +83,9 @@ def test_lamps_are_never_inside_a_solid(cornell: Scene) -> None:
     # Walls have fronts inwards: the free side of every plane that a lamp stands before.
     for wall in (*range(8), 28, 29):
         assert ((places - cornell.corners[wall, 0]) @ cornell.geometric_normals[wall] > -1e-3).all()
-    # Everywhere else is reached: the share of the box that the blocks fill, 12 % and 3 % behind the slanted wall, is turned down.
-    assert 0.03 < drawn.rejected / drawn.candidates < 0.25
+    # Turned down is what the blocks fill (8 %) and what lies behind the slanted walls (1 %), and no more: 9 % of 165 tries
+    # have a standard deviation of 2.2 %.
+    assert 0.02 < drawn.rejected / drawn.candidates < 0.16
 
 
 @pytest.mark.parametrize("kind", ["point", "rect", "sphere"])

@@ -18,7 +18,7 @@ from ddprt.dataset import store
 from ddprt.dataset.store import Dataset, Manifest, map_name
 from ddprt.errors import UserError
 from ddprt.files import write_tensors
-from ddprt.lights import Lighting, lighting_json, load_lightings
+from ddprt.lights import Lighting, lighting_json, load_lightings, parse_lighting
 from ddprt.progress import Progress
 from ddprt.sampling.lightings import draw_lightings
 from ddprt.sampling.points import Samples, load_samples, place_samples
@@ -143,7 +143,8 @@ class _Bake:
         for name in store.SPLITS:
             if not splits.get(name):
                 raise UserError(f"lightings: got none for {name}, expected at least 1 each for train, validation and test")
-        return [(name, lighting) for name in store.SPLITS for lighting in splits[name]], drawn
+        named = [(name, index, lighting) for name in store.SPLITS for index, lighting in enumerate(splits[name])]
+        return [(name, parse_lighting(lighting, f"{name} lighting {index}")) for name, index, lighting in named], drawn
 
     def _description(self, entries: Sequence[tuple[str, Lighting]], effects: Plan, drawn: dict[str, int]) -> dict[str, Any]:
         config = self.config
@@ -315,7 +316,14 @@ class _Bake:
             for half in range(halves)
         ]
         first = results[0]
-        stage.facts |= {"bounces": first.bounces, "remainder": first.remainder, "senders": first.senders}
+        known = np.isfinite(first.remainder)
+        stage.facts |= {"bounces": first.bounces, "senders": first.senders}
+        stage.facts["remainder"] = f"{first.remainder:.2g}" if known else "unbounded"
+        if effects.bounces < 0 and not first.converged:
+            self.progress.say(
+                f"warning: light was followed for {first.bounces} bounces and has not died away (bound on the rest: "
+                f"{stage.facts['remainder']} of each lighting's peak); lower the largest albedo"
+            )
         if halves == 1:
             return first.indirect, np.zeros_like(direct)
         return (first.indirect + results[1].indirect) / 2, (first.indirect - results[1].indirect) / 2

@@ -42,6 +42,8 @@ def parse_lighting(records: Any, where: str = "lighting") -> Lighting:
         records = [records]
     if not isinstance(records, list | tuple):
         raise UserError(f"{where}: got {type(records).__name__}, expected a light or a list of lights")
+    if len(records) == 0:
+        raise UserError(f"{where}: got no light, expected at least one")
     for index, record in enumerate(records):
         if isinstance(record, dict) and record.get("type") not in list(LIGHTS):
             hint = nearest(str(record.get("type")), LIGHTS)

@@ -148,12 +148,13 @@ def spot_check(scene: Scene, data: Dataset, config: Config) -> dict[str, Any]:
       z-scores, the relative bias, and the values of both sides, (lightings, texels, 3); empty where it is switched off.
     """
     from ddprt.scene.atlas import build_atlas
+    from ddprt.transport.effects import plan
     from ddprt.transport.embree import Tracer
     from ddprt.transport.reference import on_texels, trace_reference
 
     test = data.split("test")[: config.report.spot_check_lightings]
     count = min(config.report.spot_check_texels, int(data.covered.sum()))
-    if count == 0 or config.transport.bounces >= 0:
+    if count == 0:
         return {}
     atlas = build_atlas(scene, config.atlas.resolution, config.atlas.padding)
     rng = seeds.stream(config.seed, "spot check")
@@ -168,6 +169,7 @@ def spot_check(scene: Scene, data: Dataset, config: Config) -> dict[str, Any]:
             count,
             config.report.spot_check_samples,
             seed=seeds.number(config.seed, "spot check", index),
+            bounces=plan(scene, data.lightings, bounces=config.transport.bounces).bounces,
         )
         for index in test
     ]

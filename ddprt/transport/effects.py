@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ddprt.catalogue import Catalogue
-from ddprt.lights import LIGHTS, Lighting
+from ddprt.lights import LIGHTS, Lighting, parse_lighting
 from ddprt.scene.mesh import Scene
 
 _FLAT = 1e-6  # of the radius: how far a corner may stand before a triangle's plane and still be in it
@@ -61,7 +61,8 @@ def plan(scene: Scene, lightings: Sequence[Lighting], *, bounces: int = -1) -> P
       lightings: all that will be baked.
       bounces: -1 lets the scene decide; 0 and up is forced.
     """
-    effects = tuple(decide(name, scene, lightings, bounces) for name, decide in EFFECTS.items())
+    parsed = [parse_lighting(lighting, f"lighting {index}") for index, lighting in enumerate(lightings)]
+    effects = tuple(decide(name, scene, parsed, bounces) for name, decide in EFFECTS.items())
     return Plan(effects, bounces if effects[0].called else 0)
 
 

@@ -41,7 +41,7 @@ def irradiance(
     place, facing = np.asarray(positions, np.float64), np.asarray(normals, np.float64)
     if place.ndim != 2 or place.shape[1] != 3 or facing.shape != place.shape or len(place) == 0:
         raise UserError(
-            f"positions and normals: got shapes {place.shape} and {facing.shape}, expected (points, 3) for both, 1 point or more"
+            f"positions and normals: got shapes {place.shape} and {facing.shape}, expected (points, 3) for both, points > 0"
         )
     length = np.linalg.norm(facing, axis=1, keepdims=True)
     if not np.isfinite([place, facing]).all() or not (length > 0).all():

@@ -41,6 +41,11 @@ class OperatorResult:
     remainder: float
     senders: int
 
+    @property
+    def converged(self) -> bool:
+        """Whether what is left is negligible."""
+        return self.remainder <= _TOLERANCE
+
 
 def operator_indirect(
     tracer: Tracer,
