@@ -14,7 +14,8 @@ import pytest
 
 import ddprt
 from ddprt.config import Config
-from ddprt.dataset.generate import bake, split_lightings
+from ddprt.dataset.generate import bake
+from ddprt.dataset.splits import split_lightings
 from ddprt.dataset.store import Manifest, average_into_points, expected_files, open_dataset, read_map, write_map
 from ddprt.errors import UserError
 from ddprt.progress import Progress
@@ -46,7 +47,7 @@ def baked(cornell: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_everything_expected_is_there(baked: Path) -> None:
     data = open_dataset(baked)
-    assert {name for name in expected_files(data.description)} <= set(files(baked))
+    assert set(expected_files(data.description)) <= set(files(baked))
     assert [len(data.split(name)) for name in ("train", "validation", "test")] == [4, 2, 2]
     direct, indirect = data.maps("direct", range(8)), data.maps("indirect", range(8))
     assert direct.shape == indirect.shape == (8, int(data.covered.sum()), 3)

@@ -5,7 +5,7 @@ gives the same bits as one that was never stopped.
 """
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,12 +15,12 @@ import numpy as np
 from ddprt import __version__, seeds
 from ddprt.config import Config
 from ddprt.dataset import store
+from ddprt.dataset.splits import Splits, choose_lightings, doubt
 from ddprt.dataset.store import Dataset, Manifest, map_name
 from ddprt.errors import UserError
 from ddprt.files import write_tensors
-from ddprt.lights import Lighting, lighting_json, load_lightings, parse_lighting
+from ddprt.lights import Lighting, lighting_json
 from ddprt.progress import Progress
-from ddprt.sampling.lightings import draw_lightings
 from ddprt.sampling.points import Samples, load_samples, place_samples
 from ddprt.scene.atlas import Atlas, build_atlas
 from ddprt.scene.mesh import Scene
@@ -30,11 +30,7 @@ from ddprt.transport.embree import Tracer
 from ddprt.transport.measure import measure
 
 _SENDER_RESOLUTION = 64  # senders along a side where transport.sender_resolution leaves it open
-
 _NAMED = 8  # doubtful lightings that a warning spells out
-_STRENGTHS = ("intensity", "irradiance", "radiance")
-
-Splits = Mapping[str, Sequence[Lighting]]
 
 
 def bake(
@@ -74,16 +70,6 @@ def bake(
     return _Bake(scene, config, folder, progress or Progress(quiet=True)).run(lightings, keep_alive)
 
 
-def split_lightings(lightings: Sequence[Lighting]) -> dict[str, list[Lighting]]:
-    """One list into train, validation and test by order: the last fifth is test, the tenth before it validation."""
-    count = len(lightings)
-    if count < 3:
-        raise UserError(f"lightings: got {count}, expected at least 3 (train, validation, test)")
-    test, validation = max(1, count // 5), max(1, count // 10)
-    first = count - test - validation
-    return {"train": [*lightings[:first]], "validation": [*lightings[first:-test]], "test": [*lightings[-test:]]}
-
-
 class _Bake:
     """One bake from start to end; every stage skips what the manifest already holds."""
 
@@ -93,7 +79,7 @@ class _Bake:
 
     def run(self, given: Sequence[Lighting] | Splits | None, keep_alive: Any) -> Dataset:
         with self.progress.stage("lightings") as stage:
-            entries, drawn = self._entries(given)
+            entries, drawn = choose_lightings(given, self.config.lightings, self.scene, self.tracer, self.config.seed)
             stage.facts |= {"lightings": len(entries), **drawn}
         effects = plan(self.scene, [lighting for _, lighting in entries], bounces=self.config.transport.bounces)
         description = self._description(entries, effects, drawn)
@@ -111,40 +97,6 @@ class _Bake:
         self._indirect(dataset, manifest, atlas, effects, "train", dataset.split("train") + dataset.split("validation"))
         self._indirect(dataset, manifest, atlas, effects, "test", dataset.split("test"))
         return dataset
-
-    def _entries(self, given: Sequence[Lighting] | Splits | None) -> tuple[list[tuple[str, Lighting]], dict[str, int]]:
-        config = self.config.lightings
-        counts = {name: getattr(config, name) for name in store.SPLITS}
-        drawn: dict[str, int] = {}
-        if given is None and config.file:
-            listed = load_lightings(config.file)
-            if len(listed) < sum(counts.values()):
-                raise UserError(
-                    f"lightings.file {config.file}: got {len(listed)} lightings, expected {sum(counts.values())} "
-                    f"({', '.join(f'{name} {count}' for name, count in counts.items())}); lower lightings.train"
-                )
-            ends = np.cumsum(list(counts.values()))
-            given = {name: listed[end - counts[name] : end] for name, end in zip(counts, ends, strict=True)}
-        if given is None:
-            given = {}
-            for name, count in counts.items():
-                draw = draw_lightings(
-                    config,
-                    name,
-                    count,
-                    bounds=self.scene.bounds,
-                    clearance=self.tracer.clearance,
-                    seed=self.config.seed,
-                )
-                given[name] = draw.lightings
-                drawn["positions_tried"] = drawn.get("positions_tried", 0) + draw.candidates
-                drawn["positions_rejected"] = drawn.get("positions_rejected", 0) + draw.rejected
-        splits = given if isinstance(given, Mapping) else split_lightings(given)
-        for name in store.SPLITS:
-            if not splits.get(name):
-                raise UserError(f"lightings: got none for {name}, expected at least 1 each for train, validation and test")
-        named = [(name, index, lighting) for name in store.SPLITS for index, lighting in enumerate(splits[name])]
-        return [(name, parse_lighting(lighting, f"{name} lighting {index}")) for name, index, lighting in named], drawn
 
     def _description(self, entries: Sequence[tuple[str, Lighting]], effects: Plan, drawn: dict[str, int]) -> dict[str, Any]:
         config = self.config
@@ -240,10 +192,9 @@ class _Bake:
         for index, lighting in enumerate(dataset.lightings):
             black = not store.read_map(self.folder / map_name("direct", index)).any()
             dark += black
-            why = self._misplaced(lighting, black)
+            why = doubt(lighting, black, self.scene, self.tracer)
             if why:
-                split = dataset.description["lightings"][index]["split"]
-                faults.append(f"{index} ({split}): {'lights nothing: it ' if black else ''}{why}")
+                faults.append(f"{index} ({dataset.description['lightings'][index]['split']}): {why}")
         if dark == len(dataset.lightings):
             raise UserError(
                 f"lightings: all {dark} light nothing, expected light on the scene; the first: {faults[0]}; "
@@ -252,20 +203,6 @@ class _Bake:
         if faults:
             more = f"; and {len(faults) - _NAMED} more" if len(faults) > _NAMED else ""
             self.progress.say(f"warning: {len(faults)} doubtful lightings: {'; '.join(faults[:_NAMED])}{more}")
-
-    def _misplaced(self, lighting: Lighting, black: bool) -> str:
-        """Why a lighting is doubtful, empty where it is not."""
-        places = [anchor for light in lighting if (anchor := light.anchor()) is not None]
-        if len(places) == len(lighting) and not (self.tracer.clearance(np.array(places)) > 0).any():
-            return "stands inside a solid or behind a wall"
-        if not black:
-            return ""
-        brightness = [value for light in lighting_json(lighting) for key in _STRENGTHS for value in light.get(key, ())]
-        if not any(brightness):
-            return "has no intensity"
-        low, high = self.scene.bounds
-        outside = [((place < low) | (place > high)).any() for place in places]
-        return "stands outside the scene" if len(places) == len(lighting) and all(outside) else "faces away or is shadowed"
 
     def _indirect(
         self, dataset: Dataset, manifest: Manifest, atlas: Atlas, effects: Plan, split: str, indices: list[int]

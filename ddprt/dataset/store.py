@@ -25,7 +25,6 @@ from ddprt.scene.atlas import Atlas
 from ddprt.scene.exr import exposure_for, read_exr, write_exr
 
 SCHEMA = 1
-SPLITS = ("train", "validation", "test")
 _GBUFFER = ("position", "normal", "geometric_normal", "albedo", "area", "coverage")
 
 
