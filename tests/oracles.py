@@ -45,20 +45,23 @@ def clipped_area(corners: np.ndarray, column: int, row: int, side: int) -> tuple
 
 
 def first_hit(scene: Scene, origin: np.ndarray, direction: np.ndarray) -> tuple[int, float, float, float]:
-    """Triangle (-1: none), distance and weights of the second and third corner. Moeller and Trumbore, JGT 1997."""
-    nearest = (-1, np.inf, 0.0, 0.0)
-    for index, (a, b, c) in enumerate(scene.corners):
-        p = np.cross(direction, c - a)
-        determinant = (b - a) @ p
-        if determinant == 0:
-            continue
-        u = (origin - a) @ p / determinant
-        q = np.cross(origin - a, b - a)
-        v = direction @ q / determinant
-        distance = (c - a) @ q / determinant
-        if u >= 0 and v >= 0 and u + v <= 1 and 0 < distance < nearest[1]:
-            nearest = (index, distance, u, v)
-    return nearest
+    """Triangle (-1: none), distance and weights of the second and third corner, by trying every triangle.
+
+    Reference: Moeller and Trumbore, "Fast, Minimum Storage Ray-Triangle Intersection", JGT 1997.
+    """
+    a, b, c = scene.corners.swapaxes(0, 1)
+    p = np.cross(direction, c - a)
+    determinant = ((b - a) * p).sum(1)
+    parallel = determinant == 0
+    determinant[parallel] = 1
+    q = np.cross(origin - a, b - a)
+    u, v = ((origin - a) * p).sum(1) / determinant, q @ direction / determinant
+    distance = ((c - a) * q).sum(1) / determinant
+    distance[parallel | (u < 0) | (v < 0) | (u + v > 1) | (distance <= 0)] = np.inf
+    nearest = int(distance.argmin())
+    if np.isinf(distance[nearest]):
+        return -1, np.inf, 0.0, 0.0
+    return nearest, float(distance[nearest]), float(u[nearest]), float(v[nearest])
 
 
 def direct_irradiance(scene: Scene, lighting: Lighting, position: np.ndarray, normal: np.ndarray) -> np.ndarray:

@@ -222,26 +222,46 @@ def test_gather_rows_agree_with_brute_force(cornell: Scene) -> None:
         assert oracles.chi_square(counts, np.where(expected < 1e-6, 0, expected)) > 1e-4
 
 
-def test_operator_agrees_with_the_reference(cornell: Scene, cornell_atlas: Atlas) -> None:
-    """Texel by texel, with both variances. Senders as fine as the atlas keep the bias (0.5 %) below the noise (8 %)."""
-    atlas = cornell_atlas
-    direct = reference(cornell, atlas, LAMP, 64, seed=1, bounces=0).direct
+@pytest.fixture(scope="module")
+def bare(cornell: Scene) -> Scene:
+    """The Cornell box without its blocks."""
+    walls = [*range(8), 28, 29]
+    return checked(
+        "bare", cornell.positions, cornell.triangles[walls], material=cornell.material[walls], materials=cornell.materials
+    )
+
+
+@pytest.mark.parametrize("name", ["bare", "corridor"])
+def test_operator_agrees_with_the_reference(name: str, request: pytest.FixtureRequest) -> None:
+    """Texel by texel, with both variances, where no sender reaches under a block."""
+    scene = request.getfixturevalue(name)
+    atlas = build_atlas(scene, 64)
+    lamp = LAMP if name == "bare" else parse_lighting({"type": "point", "position": [1, 1.5, 1], "intensity": [1, 1, 1]})
+    direct = reference(scene, atlas, lamp, 64, seed=1, bounces=0).direct
     # Path sums are skewed: a low mean comes with a low variance, which would shift z. So the variance is another run's.
-    found, other = (reference(cornell, atlas, LAMP, 400, seed=seed) for seed in (2, 3))
+    found, other = (reference(scene, atlas, lamp, 400, seed=seed) for seed in (2, 3))
     runs = [
-        operator(cornell, atlas, direct[None], samples=64, sender_resolution=64, stream=f"run {k}").indirect[0]
-        for k in range(6)
+        operator(scene, atlas, direct[None], samples=64, sender_resolution=64, stream=f"run {k}").indirect[0] for k in range(6)
     ]
     by_operator, variance = np.mean(runs, axis=0), np.var(runs, axis=0, ddof=1) / len(runs)
-    # Texels that see the light by a sliver have estimates far from normal: the floor beneath the blocks, dark but for its rim.
+    # The dimmest corners behind the door see light in one path of hundreds: far from normal.
     lit = by_operator[:, 1] > 0.1 * np.median(by_operator[:, 1])
-    assert lit.mean() > 0.9
-    difference, error = (by_operator - found.indirect)[lit, 1], np.sqrt(variance + other.indirect_variance)[lit, 1]
-    z = difference / error
-    assert np.median(error / by_operator[lit, 1]) < 0.1
-    assert abs(z.mean()) < 0.1  # 2200 texels: 0.02 of noise, and the bias over the noise: 0.06
+    assert lit.mean() > 0.95
+    z = ((by_operator - found.indirect) / np.sqrt(variance + other.indirect_variance))[lit, 1]
+    assert abs(z.mean()) < 0.1  # 2000 texels: 0.02 of noise
     assert abs(z.std() - 1) < 0.1
-    assert mean(atlas, by_operator)[0] == pytest.approx(mean(atlas, found.indirect)[0], rel=0.015)
+    total, error = mean(atlas, found.indirect, found.indirect_variance)
+    assert error < 0.003 * total
+    assert mean(atlas, by_operator)[0] == pytest.approx(total, rel=0.01)
+
+
+def test_operator_on_the_cornell_box(cornell: Scene, cornell_atlas: Atlas) -> None:
+    """Senders that reach under a block spread light to where nothing sees it: measured -0.8 % of the mean at 64 x 64."""
+    found = reference(cornell, cornell_atlas, LAMP, 256, seed=2)
+    by_operator = operator(cornell, cornell_atlas, found.direct[None], sender_resolution=64)
+    expected, error = mean(cornell_atlas, found.indirect, found.indirect_variance)
+    assert error < 0.004 * expected
+    assert mean(cornell_atlas, by_operator.indirect[0])[0] == pytest.approx(expected, rel=0.02)
 
 
 def test_sender_bias_falls_with_resolution(cornell: Scene, cornell_atlas: Atlas) -> None:
@@ -411,18 +431,14 @@ def test_the_reference_is_homogeneous_and_additive(cornell: Scene, cornell_atlas
 
 
 def test_channels_do_not_mix() -> None:
-    scene = checked(
-        "room", *(lambda p, t: (p, t[:, ::-1]))(*icosphere(1)), materials=(Material("magenta", (0.8, 0.0, 0.4)),)
-    )  # fmt: skip
-    direct, indirect = ddprt.irradiance(scene, CENTRE, [[0, 0.5, 0]], [[0, 1, 0]], samples=4096)
+    points, triangles = icosphere(1)
+    scene = checked("room", points, triangles[:, ::-1], materials=(Material("magenta", (0.8, 0.0, 0.4)),))
+    _, indirect = ddprt.irradiance(scene, CENTRE, [[0, 0.5, 0]], [[0, 1, 0]], samples=4096)
     assert indirect[0, 1] == 0
     assert indirect[0, 0] > 3 * indirect[0, 2] > 0
 
 
 def test_no_light_gives_exactly_nothing(cornell: Scene) -> None:
-    direct, indirect = ddprt.irradiance(cornell, [], [[0.3, 0, 0.3]], [[0, 1, 0]], samples=64)
-    assert not direct.any()
-    assert not indirect.any()
     dark = tuple(lamp.scaled(0.0) for lamp in LAMP)
     assert not np.any(ddprt.irradiance(cornell, dark, [[0.3, 0, 0.3]], [[0, 1, 0]], samples=64))
 
@@ -450,6 +466,23 @@ def test_light_behind_walls_reaches_nothing(cornell: Scene, cornell_atlas: Atlas
         assert (cornell_atlas.position[reached][:, [0, 2]] < corners.max(0) + margin).all()
     else:
         assert not reached.any()
+
+
+def test_backs_block_and_absorb() -> None:
+    """A sheet lit from above, with its back to the floor beneath it: the floor gets nothing, by either integrator."""
+    floor = rectangle((-0.2, -0.2), (0.2, 0.2), 0.0, 1, facing=1)
+    sheet = rectangle((-2.0, -2.0), (2.0, 2.0), 0.5, 1, facing=1)
+    scene = faceted("sheet", np.array([floor, sheet]), (Material("white", (0.9,) * 3),))
+    lamp = parse_lighting({"type": "point", "position": [0, 1, 0], "intensity": [1, 1, 1]})
+    atlas = build_atlas(scene, 32)
+    found = reference(scene, atlas, lamp, 64)
+    beneath = atlas.position[:, 1] < 0.1
+    assert beneath.any()
+    assert found.direct[~beneath].all()
+    by_operator = operator(scene, atlas, found.direct[None]).indirect[0]
+    assert not found.direct[beneath].any()
+    assert not found.indirect.any()
+    assert not by_operator.any()
 
 
 def test_the_next_room_is_lit_through_the_door_alone(corridor: Scene) -> None:
@@ -496,9 +529,7 @@ def test_lights_at_vertices_and_on_surfaces_stay_finite(
 def test_a_scene_far_away_is_lit_as_here(cornell: Scene) -> None:
     """Rays live about the scene's centre, so a kilometre of offset costs no precision."""
     offset = np.array([1024.0, -2048.0, 512.0])  # exact in float64 for millimetres up to rounding of 2e-13
-    far = checked(
-        "far", cornell.positions + offset, cornell.triangles, material=cornell.material, materials=cornell.materials
-    )  # fmt: skip
+    far = checked("far", cornell.positions + offset, cornell.triangles, material=cornell.material, materials=cornell.materials)
     place, normal = np.array([[0.4, 0.0, 0.1], [0.1, 0.0, 0.4]]), np.array([[0.0, 1, 0], [0, 1, 0]])
     here = ddprt.irradiance(cornell, LAMP, place, normal, samples=256, return_variance=True)
     there = ddprt.irradiance(
@@ -558,6 +589,8 @@ def test_many_samples_are_traced_in_rounds(cornell: Scene) -> None:
     few = ddprt.irradiance(cornell, LAMP, [[0.3, 0, 0.5]], [[0, 1, 0]], samples=1 << 14, return_variance=True)
     many = ddprt.irradiance(cornell, LAMP, [[0.3, 0, 0.5]], [[0, 1, 0]], samples=3 << 15, return_variance=True)
     assert (np.abs(few[1] - many[1]) < 4 * np.sqrt(few[3] + many[3])).all()
+    first = ddprt.irradiance(cornell, LAMP, [[0.3, 0, 0.5]], [[0, 1, 0]], samples=1 << 15)[1]
+    assert (np.abs(first - many[1]) > 1e-6 * first).all()  # the second and third round are not the first again
     np.testing.assert_allclose(many[3] * 6, few[3], rtol=0.25)  # the variance of a variance, heavy-tailed: a few percent
 
 
