@@ -185,3 +185,21 @@ def distance_to_triangle(point: np.ndarray, corners: np.ndarray) -> float:
         share = np.clip((point - start) @ along / (along @ along), 0, 1)
         nearest = min(nearest, np.linalg.norm(point - start - share * along))
     return float(nearest)
+
+
+# Tops of Cornell's two blocks as published, x and z in metres, and their heights.
+BLOCKS = [
+    (np.array([[130, 65], [82, 225], [240, 272], [290, 114]]) / 1000, 0.165),
+    (np.array([[423, 247], [265, 296], [314, 456], [472, 406]]) / 1000, 0.330),
+]
+
+
+def inside_a_block(point: np.ndarray) -> bool:
+    """Whether a point lies in one of Cornell's prisms: below its top, and on one side of all four edges."""
+    for corners, height in BLOCKS:
+        along = np.roll(corners, -1, axis=0) - corners
+        offset = point[[0, 2]] - corners
+        side = along[:, 0] * offset[:, 1] - along[:, 1] * offset[:, 0]
+        if point[1] < height and (np.all(side > 0) or np.all(side < 0)):
+            return True
+    return False

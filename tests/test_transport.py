@@ -18,7 +18,7 @@ from ddprt.scene.shapes import box, faceted, icosphere, rectangle
 from ddprt.transport.effects import EFFECTS, plan, sees_nothing
 from ddprt.transport.embree import Tracer
 from ddprt.transport.measure import measure
-from ddprt.transport.operator import OperatorResult, operator_indirect
+from ddprt.transport.operator import OperatorResult, find_exposed, operator_indirect
 from ddprt.transport.reference import Estimate, on_points, on_texels, trace_reference
 
 CENTRE = parse_lighting({"type": "point", "position": [0, 0, 0], "intensity": [1, 1, 1]})
@@ -196,8 +196,8 @@ def test_reference_agrees_with_a_path_tracer_of_loops(cornell: Scene) -> None:
 def test_gather_rows_agree_with_brute_force(cornell: Scene) -> None:
     """One-hot direct light brings out G: which share of a texel's hemisphere sees each sender."""
     atlas = build_atlas(cornell, 32)
-    senders = atlas.senders(8)
-    one_hot = np.eye(len(senders.area))[:, senders.of_texel, None] * np.ones(3)
+    senders = atlas.senders(8, find_exposed(Tracer.of(cornell), atlas))
+    one_hot = (senders.of_texel == np.arange(len(senders.area))[:, None])[..., None] * np.ones(3)
     found = operator(cornell, atlas, one_hot, samples=4096, sender_resolution=8, bounces=1)
     assert found.senders == len(senders.area)
     rows = found.indirect[:, :, 0].T / senders.albedo[:, 0]
@@ -215,7 +215,7 @@ def test_gather_rows_agree_with_brute_force(cornell: Scene) -> None:
                 counts[-1] += 1
                 continue
             column, row = (np.array([1 - u - v, u, v]) @ atlas.uv[triangle] * 32).astype(int)
-            counts[senders.of_texel[atlas.slot[row, column]]] += 1
+            counts[senders.of_texel[atlas.slot[row, column]]] += 1  # -1, a texel in a solid, is the last entry
         expected = np.append(rows[texel], max(1 - rows[texel].sum(), 0))
         assert (expected > 0.01).sum() > 5
         # The fast row's own noise (4096 even rays against 1200) is an eighth of the twin's variance at most.
@@ -256,12 +256,24 @@ def test_operator_agrees_with_the_reference(name: str, request: pytest.FixtureRe
 
 
 def test_operator_on_the_cornell_box(cornell: Scene, cornell_atlas: Atlas) -> None:
-    """Senders that reach under a block spread light to where nothing sees it: measured -0.8 % of the mean at 64 x 64."""
+    """Texels under the blocks take no part; those that reach half under them still spread light to where nothing sees it."""
     found = reference(cornell, cornell_atlas, LAMP, 256, seed=2)
     by_operator = operator(cornell, cornell_atlas, found.direct[None], sender_resolution=64)
     expected, error = mean(cornell_atlas, found.indirect, found.indirect_variance)
     assert error < 0.004 * expected
-    assert mean(cornell_atlas, by_operator.indirect[0])[0] == pytest.approx(expected, rel=0.02)
+    assert mean(cornell_atlas, by_operator.indirect[0])[0] == pytest.approx(expected, rel=0.01)
+
+
+def test_texels_inside_solids_are_found(cornell: Scene, cornell_atlas: Atlas, furnace: Scene, furnace_atlas: Atlas) -> None:
+    exposed = find_exposed(Tracer.of(cornell), cornell_atlas)
+    on_floor = cornell_atlas.position[:, 1] == 0
+    lifted = cornell_atlas.position + np.array([0, 1e-4, 0])
+    hidden = np.array([oracles.inside_a_block(place) for place in lifted])
+    # A texel on the rim (9 mm wide here) may go either way.
+    assert (exposed[~on_floor]).mean() > 0.995
+    assert (exposed[on_floor] == hidden[on_floor]).mean() < 0.05
+    assert (~exposed).sum() > 0.5 * hidden.sum() > 10
+    assert find_exposed(Tracer.of(furnace), furnace_atlas).all()
 
 
 def test_sender_bias_falls_with_resolution(cornell: Scene, cornell_atlas: Atlas) -> None:

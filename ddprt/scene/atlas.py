@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from ddprt import warp
-from ddprt.axes import Float, Float32, Float64, Int, Int32
+from ddprt.axes import Bool, Float, Float32, Float64, Int, Int32
 from ddprt.errors import UserError
 from ddprt.scene.mesh import Scene
 from ddprt.scene.raster import rasterise
@@ -75,7 +75,7 @@ class Senders:
     """The coarser atlas that light bounces off: blocks of texels that never cross charts.
 
     Attributes:
-      of_texel: sender of each covered texel.
+      of_texel: sender of each covered texel, -1 for texels that take no part.
       area: m².
       albedo: area-weighted mean of the texels' albedo.
       sampler: points on each sender.
@@ -152,17 +152,21 @@ class Atlas:
         image[self.texel] = values
         return image.reshape(self.resolution, self.resolution, *values.shape[1:])
 
-    def senders(self, resolution: int) -> Senders:
-        """Groups texels so that about `resolution` senders lie along a side."""
+    def senders(self, resolution: int, exposed: Bool[np.ndarray, " texels"]) -> Senders:
+        """Groups the exposed texels (at least one) so that about `resolution` senders lie along a side."""
         block = max(1, round(self.resolution / resolution))
         row, column = np.divmod(self.texel, self.resolution)
         across = -(-self.resolution // block)
         key = (self.chart.astype(np.int64) * across + row // block) * across + column // block
-        _, of_texel = np.unique(key, return_inverse=True)
-        area = np.bincount(of_texel, self.area)
-        albedo = np.stack([np.bincount(of_texel, self.area * self.albedo[:, c]) for c in range(3)], 1) / area[:, None]
-        sampler = SurfaceSampler.build(of_texel[self.piece_texel], self.piece_area, self.piece_corners, self.piece_triangle)
-        return Senders(of_texel.astype(np.int32), area, albedo, sampler)
+        _, group = np.unique(key[exposed], return_inverse=True)
+        weight = self.area[exposed]
+        area = np.bincount(group, weight)
+        albedo = np.stack([np.bincount(group, weight * self.albedo[exposed, c]) for c in range(3)], 1) / area[:, None]
+        of_texel = np.full(self.count, -1, np.int32)
+        of_texel[exposed] = group
+        kept = exposed[self.piece_texel]
+        pieces = self.piece_texel[kept], self.piece_area[kept], self.piece_corners[kept], self.piece_triangle[kept]
+        return Senders(of_texel, area, albedo, SurfaceSampler.build(of_texel[pieces[0]], *pieces[1:]))
 
 
 def build_atlas(scene: Scene, resolution: int = 256, padding: int = 2) -> Atlas:

@@ -17,6 +17,7 @@ import numpy as np
 from ddprt import warp
 from ddprt.axes import Bool, Float32, Float64, Int32
 from ddprt.errors import UserError
+from ddprt.scene.distance import distance_within
 from ddprt.scene.mesh import Scene
 
 SELF_OFFSET = 2e-6
@@ -63,7 +64,8 @@ class Tracer:
             from embreex.rtcore_scene import EmbreeScene
         except ImportError as error:
             raise UserError(f"embreex: got {error}, expected the ray tracer; pip install embreex") from None
-        low, high = corners.min((0, 1)), corners.max((0, 1))
+        self._world, self._boxes = corners, np.stack([corners.min(1), corners.max(1)], 1)
+        low, high = self._boxes[:, 0].min(0), self._boxes[:, 1].max(0)
         self.centre = (low + high) / 2
         self.radius = float(np.linalg.norm(high - low) / 2)
         self.offset = np.float32(2 * SELF_OFFSET * self.radius)
@@ -117,8 +119,8 @@ class Tracer:
     def clearance(self, positions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
         """Free radius about positions in world space, metres; 0 inside a solid or behind a room's walls.
 
-        A position counts as free when less than half of the surfaces it sees show their backs. The radius is that of the
-        nearest of 256 spread hits: an upper estimate of the true distance, tight to a few percent before a flat wall.
+        A position counts as free when less than half of the surfaces it sees along 256 spread rays show their backs. The
+        radius is exact.
         """
         directions = warp.sample_sphere(warp.sobol(_PROBES, 2, seed=1))
         origins = np.repeat((positions - self.centre).astype(np.float32), _PROBES, 0)
@@ -126,7 +128,13 @@ class Tracer:
         hit = (hits.triangle >= 0).reshape(-1, _PROBES)
         back = hit & ~hits.front.reshape(-1, _PROBES)
         nearest = np.where(hit, hits.distance.reshape(-1, _PROBES), np.inf).min(1).astype(np.float64)
-        return np.where(2 * back.sum(1) > hit.sum(1), 0.0, nearest)
+        free = 2 * back.sum(1) <= hit.sum(1)
+        exact = [
+            distance_within(self._world, self._boxes, position, reach)
+            for position, reach in zip(positions[free], nearest[free], strict=True)
+        ]
+        nearest[free], nearest[~free] = exact, 0.0
+        return nearest
 
     def map(self, work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
         """Results of `work` in the order of `items`, at most twice the threads ahead; NumPy and Embree free the GIL."""

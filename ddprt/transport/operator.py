@@ -7,7 +7,8 @@ and every lighting of the batch is then one column of a matrix product:
     receivers:  E_indirect = G R x
 
 Senders are the receivers' own texels in blocks (`Atlas.senders`), so their direct light is an area-weighted mean that
-costs no ray. The price is light averaged inside a block: a bias that the report's spot check measures against `reference`.
+costs no ray. Texels inside a solid (a floor under a block that stands on it) take no part: nothing sees them. The price
+is light averaged inside a sender: a bias that the report's spot check measures against `reference`.
 """
 
 from collections.abc import Callable, Iterator
@@ -16,11 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ddprt import seeds, warp
-from ddprt.axes import Float32, Int, Int32
+from ddprt.axes import Bool, Float32, Int, Int32
 from ddprt.scene.atlas import Atlas, Senders, SurfaceSampler
 from ddprt.transport.embree import Tracer, lifted
 
 _TILE_RAYS = 1 << 16  # rays gathered together by one thread
+_PROBES = 16  # rays that tell an open texel from one inside a solid
 _TOLERANCE = 1e-4  # of a lighting's largest indirect value: where the series stops
 _MAX_BOUNCES = 512  # a closed white room never ends; what is left is reported
 
@@ -70,7 +72,10 @@ def operator_indirect(
       bounces: -1 sums the series until what is left is negligible; otherwise exactly this many, at least 1.
       advance: told the number of texels after each finished tile.
     """
-    senders = atlas.senders(sender_resolution)
+    exposed = find_exposed(tracer, atlas)
+    if not exposed.any():
+        return OperatorResult(np.zeros_like(direct), 0, 0.0, 0)
+    senders = atlas.senders(sender_resolution, exposed)
     rng = seeds.stream(seed, "gather", *stream.encode())
     pattern = warp.sobol(samples, 4, seeds.number(seed, "gather pattern", *stream.encode()))
     light, summed, remainder = _solve(tracer, atlas, senders, direct, pattern, rng, bounces)
@@ -82,6 +87,21 @@ def operator_indirect(
         advance(len(rows))
     shape = (atlas.count, len(direct), 3)
     return OperatorResult(np.ascontiguousarray(indirect.reshape(shape).swapaxes(0, 1)), summed, remainder, len(senders.area))
+
+
+def find_exposed(tracer: Tracer, atlas: Atlas) -> Bool[np.ndarray, " texels"]:
+    """Texels in the open: at least half of what they see along 16 rays are fronts, or nothing."""
+    pattern = warp.sobol(_PROBES, 4, seed=1)
+
+    def work(first: int) -> Bool[np.ndarray, " tile"]:
+        last = min(first + _TILE_RAYS // _PROBES, atlas.count)
+        u = np.tile(pattern, (last - first, 1))
+        positions, triangle = atlas.sampler.sample(np.repeat(np.arange(first, last), _PROBES), u[:, :2])
+        directions = warp.to_world(warp.sample_cosine(u[:, 2:]), tracer.frames[triangle])
+        hits = tracer.closest(lifted(tracer, positions, tracer.normals[triangle]), directions)
+        return (hits.front | (hits.triangle < 0)).reshape(-1, _PROBES).sum(1) * 2 >= _PROBES
+
+    return np.concatenate(list(tracer.map(work, range(0, atlas.count, _TILE_RAYS // _PROBES))))
 
 
 def _solve(
@@ -125,8 +145,10 @@ def _mean_over_senders(
 ) -> Float32[np.ndarray, "senders columns"]:
     from scipy.sparse import csr_array
 
-    share = (atlas.area / senders.area[senders.of_texel]).astype(np.float32)
-    mean = csr_array((share, (senders.of_texel, np.arange(atlas.count))), shape=(len(senders.area), atlas.count))
+    texel = np.flatnonzero(senders.of_texel >= 0)
+    sender = senders.of_texel[texel]
+    share = (atlas.area[texel] / senders.area[sender]).astype(np.float32)
+    mean = csr_array((share, (sender, texel)), shape=(len(senders.area), atlas.count))
     return mean @ np.ascontiguousarray(direct.swapaxes(0, 1)).reshape(atlas.count, -1)
 
 
