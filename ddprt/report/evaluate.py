@@ -150,7 +150,7 @@ def spot_check(scene: Scene, data: Dataset, config: Config) -> dict[str, Any]:
     from ddprt.scene.atlas import build_atlas
     from ddprt.transport.effects import plan
     from ddprt.transport.embree import Tracer
-    from ddprt.transport.reference import on_texels, trace_reference
+    from ddprt.transport.reference import Estimate, on_texels, trace_reference
 
     test = data.split("test")[: config.report.spot_check_lightings]
     count = min(config.report.spot_check_texels, int(data.covered.sum()))
@@ -160,23 +160,22 @@ def spot_check(scene: Scene, data: Dataset, config: Config) -> dict[str, Any]:
     rng = seeds.stream(config.seed, "spot check")
     texels = np.sort(rng.choice(atlas.count, count, replace=False))
     tracer = Tracer.of(scene, config.transport.threads)
-    estimates = [
-        trace_reference(
-            tracer,
-            scene,
-            data.lightings[index],
-            on_texels(tracer, atlas, texels),
-            count,
-            config.report.spot_check_samples,
-            seed=seeds.number(config.seed, "spot check", index),
-            bounces=plan(scene, data.lightings, bounces=config.transport.bounces).bounces,
-        )
-        for index in test
-    ]
-    truth = np.stack([estimate.indirect for estimate in estimates])
+    bounces = plan(scene, data.lightings, bounces=config.transport.bounces).bounces
+
+    def paths(run: str) -> list[Estimate]:
+        start, samples = on_texels(tracer, atlas, texels), config.report.spot_check_samples
+        numbers = [seeds.number(config.seed, f"spot check {run}", index) for index in test]
+        return [
+            trace_reference(tracer, scene, data.lightings[index], start, count, samples, seed=number, bounces=bounces)
+            for index, number in zip(test, numbers, strict=True)
+        ]
+
+    truth = np.stack([estimate.indirect for estimate in paths("light")])
+    # Path sums are skewed: a low mean comes with a low variance, which would shift z. So the variance is a second run's.
+    variance = np.stack([estimate.indirect_variance for estimate in paths("variance")])
     baked = data.maps("indirect", test)[:, texels].astype(np.float64)
     noise = data.maps("noise", test)[:, texels].astype(np.float64)
-    variance = np.stack([estimate.indirect_variance for estimate in estimates]) + _pooled_variance(baked, noise)
+    variance += _pooled_variance(baked, noise)
     scores = z_scores(baked, truth, variance)
     return {
         **scores,
