@@ -21,6 +21,8 @@ from ddprt.scene.files import load_scene
 from ddprt.scene.mesh import Scene
 from ddprt.transport.effects import Plan, plan
 
+_AFTER_BAKE = ("fit", "evaluate", "bases curve", "spot check", "report", "export")
+
 # What learns and draws is imported where it is used: a bake needs no JAX and no matplotlib.
 
 
@@ -58,7 +60,18 @@ class Run:
         make_folder(self.folder)
         data = bake(scene, config=self.config, out=self.folder / "dataset", progress=self.progress)
         write_text(self.folder / "config.toml", self.config.to_toml())
+        if not any(stage.get("rays") for stage in self.progress.stages):
+            self._remember_bake()
         return data
+
+    def _remember_bake(self) -> None:
+        """Takes the stages of the bake from an earlier run.json where this run found everything baked."""
+        try:
+            earlier = json.loads((self.folder / "run.json").read_text())["stages"]
+        except (OSError, ValueError, KeyError):
+            return
+        baked = [stage for stage in earlier if not str(stage["name"]).startswith(_AFTER_BAKE)]
+        self.progress.stages[:] = [{**stage, "earlier": "yes"} for stage in baked] or self.progress.stages
 
     def dataset(self) -> Dataset:
         """The finished dataset of this run's folder.
@@ -138,6 +151,7 @@ class Run:
                 stages=self.progress.stages,
                 scene=self.scene,
                 plan_effects=self.effects(data).effects,
+                effect_costs={str(row["name"]): row for row in self.costs(data)},
                 command=self.command,
             )
         return path
@@ -153,6 +167,10 @@ class Run:
     def effects(self, data: Dataset) -> Plan:
         """The plan that the dataset was baked under."""
         return plan(self.scene, data.lightings, bounces=self.config.transport.bounces)
+
+    def costs(self, data: Dataset) -> list[dict[str, Any]]:
+        """The plan's effects with their rays, seconds and share of the light."""
+        return _effects(self.effects(data), self.progress.stages, data)
 
     def all(self) -> dict[str, Path]:
         """Everything, and where it is."""
@@ -183,7 +201,7 @@ class Run:
             "seed": self.config.seed,
             "digest": self.config.digest(),
             "stages": stages,
-            "effects": _effects(self.effects(data), stages, data),
+            "effects": self.costs(data),
             "machine": machine(),
         }
         write_text(self.folder / "run.json", json.dumps(document, indent=1, allow_nan=False) + "\n")

@@ -5,7 +5,6 @@ Arrays keep their floating type, so transport stays in float32.
 """
 
 import numpy as np
-from scipy.stats import qmc
 
 from ddprt.axes import Float, Float32
 
@@ -114,6 +113,8 @@ def to_world(
 
 def sobol(count: int, dimensions: int, seed: int) -> Float32[np.ndarray, "count dimensions"]:
     """Owen-scrambled Sobol points in [0, 1); any count is allowed, powers of two are the best balanced."""
+    from scipy.stats import qmc  # half a second to import: only where it is needed
+
     engine = qmc.Sobol(dimensions, scramble=True, rng=seed)
     points = engine.random_base2(max(count - 1, 0).bit_length())[:count]
     return np.minimum(points, np.nextafter(np.float32(1), np.float32(0))).astype(np.float32)

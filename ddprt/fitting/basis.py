@@ -5,7 +5,9 @@ tile. That is as accurate as a full SVD of the same data down to sigma_k / sigma
 float32 Gram matrix would be wrong from 5e-4 on.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import jax
@@ -55,52 +57,57 @@ def fit_basis(
     Reference: Belcour et al., HPG 2022, Eq. 7 and 8; Turk and Pentland 1991 for the small matrix.
     """
     with jax.enable_x64(True):
-        mean = jnp.mean(columns, 0, dtype=jnp.float64) if centre else jnp.zeros(columns.shape[1], jnp.float64)
-        tiles = [slice(first, first + _TILE) for first in range(0, columns.shape[1], _TILE)]
-        gram = jnp.zeros((len(columns), len(columns)), jnp.float64)
-        for tile in tiles:
-            gram = gram + _gram(columns[:, tile], mean[tile], weights[tile])
-        squares, rotation = jnp.linalg.eigh(gram)
-        sigma = jnp.sqrt(jnp.maximum(squares[::-1], 0))
-        rank = int(jnp.sum(sigma > RANK_CUT * sigma[0]))
+        mean, sigma, rotation = _decompose(columns, weights, centre)
+        rank = int(np.sum(np.asarray(sigma) > RANK_CUT * float(sigma[0])))
         kept = min(bases, rank)
-        turn = rotation[:, ::-1][:, :kept] / jnp.where(sigma[:kept] > 0, sigma[:kept], 1)
-        parts = [_project(columns[:, tile], mean[tile], turn) for tile in tiles]
-        vectors = jnp.concatenate(parts, 1) if kept else jnp.zeros((0, columns.shape[1]), jnp.float64)
-        vectors = _orthonormal(vectors, weights.astype(jnp.float64)).astype(jnp.float32)
-        coefficients = sum(
-            (_coefficients(columns[:, tile], mean[tile], weights[tile], vectors[:, tile]) for tile in tiles),
-            jnp.zeros((len(columns), kept), jnp.float64),
-        )
+        vectors, coefficients = _build(columns, weights, mean, rotation[:, :kept] / sigma[:kept])
         status: Status = "no_signal" if rank == 0 else "rank_deficient" if kept < bases else "ok"
         return Basis(vectors, mean.astype(jnp.float32), coefficients, sigma, rank, status)
 
 
-@jax.jit
-def _gram(tile: Array, mean: Array, weights: Array) -> Array:
-    rows = (tile - mean) * jnp.sqrt(weights.astype(jnp.float64))
-    return jnp.matmul(rows, rows.T, precision="highest")
+@partial(jax.jit, static_argnames="centre")
+def _decompose(columns: Array, weights: Array, centre: bool) -> tuple[Array, Array, Array]:
+    """Mean column, singular values and left singular vectors of the weighted data, falling, in float64."""
+    mean = jnp.mean(columns, 0, dtype=jnp.float64) if centre else jnp.zeros(columns.shape[1], jnp.float64)
+
+    def add(gram: Array, columns: Array, mean: Array, weights: Array) -> Array:
+        rows = (columns - mean) * jnp.sqrt(weights.astype(jnp.float64))
+        return gram + jnp.matmul(rows, rows.T, precision="highest")
+
+    gram = _over_tiles(add, jnp.zeros((len(columns), len(columns)), jnp.float64), columns, mean, weights)
+    squares, rotation = jnp.linalg.eigh(gram)
+    return mean, jnp.sqrt(jnp.maximum(squares[::-1], 0)), rotation[:, ::-1]
 
 
 @jax.jit
-def _project(tile: Array, mean: Array, turn: Array) -> Array:
-    return jnp.matmul(turn.T, tile - mean, precision="highest")
-
-
-@jax.jit
-def _coefficients(tile: Array, mean: Array, weights: Array, vectors: Array) -> Array:
-    return jnp.matmul((tile - mean) * weights.astype(jnp.float64), vectors.T.astype(jnp.float64), precision="highest")
-
-
-@jax.jit
-def _orthonormal(vectors: Array, weights: Array) -> Array:
-    """One Cholesky step removes what rounding left of the overlap; then the sign rule."""
-    if vectors.shape[0] == 0:
-        return vectors
+def _build(columns: Array, weights: Array, mean: Array, turn: Array) -> tuple[Array, Array]:
+    """Orthonormal vectors (float32) and the columns' coefficients (float64)."""
+    if turn.shape[1] == 0:
+        return jnp.zeros((0, columns.shape[1]), jnp.float32), jnp.zeros((len(columns), 0), jnp.float64)
+    vectors = jnp.matmul(turn.T, columns - mean, precision="highest")
+    # One Cholesky step removes what rounding left of the overlap; then the sign rule.
     overlap = jnp.matmul(vectors * weights, vectors.T, precision="highest")
     vectors = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(overlap), vectors, lower=True)
     peak = jnp.take_along_axis(vectors, jnp.argmax(jnp.abs(vectors), 1)[:, None], 1)
-    return vectors * jnp.where(peak < 0, -1, 1)
+    vectors = (vectors * jnp.where(peak < 0, -1, 1)).astype(jnp.float32)
+
+    def add(total: Array, columns: Array, mean: Array, weights: Array, vectors: Array) -> Array:
+        return total + jnp.matmul((columns - mean) * weights, vectors.T.astype(jnp.float64), precision="highest")
+
+    empty = jnp.zeros((len(columns), len(vectors)), jnp.float64)
+    return vectors, _over_tiles(add, empty, columns, mean, weights, vectors)
+
+
+def _over_tiles(add: Callable[..., Array], total: Array, *arrays: Array) -> Array:
+    """Folds `add` over tiles of the last axis, so that only one tile at a time is float64."""
+    entries = arrays[0].shape[-1]
+    whole = entries // _TILE
+
+    def step(i: Array, total: Array) -> Array:
+        return add(total, *(jax.lax.dynamic_slice_in_dim(array, i * _TILE, _TILE, -1) for array in arrays))
+
+    total = jax.lax.fori_loop(0, whole, step, total) if whole else total
+    return add(total, *(array[..., whole * _TILE :] for array in arrays)) if entries % _TILE else total
 
 
 def entry_weights(area: np.ndarray, weights: Literal["area", "texel"], channels: Literal["mono", "multi"]) -> np.ndarray:

@@ -6,16 +6,19 @@ costs one product after a single SVD: M(lambda) = C^T Q diag(S / (S² + lambda))
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ddprt.errors import UserError
 
 RANK_CUT = 1e-7
 """Singular values below this share of the largest are rounding of the float32 measurements."""
+_RIDGES = 57  # four per decade, from 1e-13 to 10 times the largest squared singular value
 ILL_CONDITIONED = 1e6
 """Condition number past which coefficients of float32 measurements are not to be trusted without a ridge."""
 
@@ -76,73 +79,76 @@ def fit_transfer(
     """
     if len(measured) != len(coefficients):
         raise ValueError(f"got {len(measured)} rows of measurements and {len(coefficients)} of coefficients, expected as many")
+    weight = np.ones(len(measured)) if importance is None else np.asarray(importance, np.float64)
+    per_point = _per_point(ridge, measured.shape[1])
+    stretch = np.ones(measured.shape[1]) if per_point is None else 1 / np.sqrt(per_point)
+    # Per-point ridges are in the stretched measurements already, so their lambda is 1; -1 stands for "auto".
+    given = -1.0 if ridge == "auto" else 1.0 if per_point is not None else float(ridge)  # type: ignore[arg-type]
+    if given < 0 and ridge != "auto":
+        raise UserError(f"fit.ridge: got {given:g}, expected 0 or more")
     with jax.enable_x64(True):
-        X, C = measured.astype(jnp.float64), coefficients.astype(jnp.float64)
-        weight = jnp.ones(len(X)) if importance is None else importance.astype(jnp.float64)
-        offset = jnp.mean(X, 0) if intercept else jnp.zeros(X.shape[1])
-        start = jnp.mean(C, 0) if intercept else jnp.zeros(C.shape[1])
-        per_point = _per_point(ridge, X.shape[1])
-        stretch = jnp.ones(X.shape[1]) if per_point is None else 1 / jnp.sqrt(per_point)
-        Q, S, Pt = jnp.linalg.svd((X - offset) * stretch, full_matrices=False)
-        QtC = Q.T @ (C - start)
-        # Choosing under per-point ridges: they are already in the stretched measurements, so lambda = 1.
-        path = jnp.zeros((0, 2))
-        if ridge == "auto":
-            ridges = jnp.concatenate([jnp.zeros(1), jnp.logspace(-13, 1, 57)]) * jnp.maximum(S[0] ** 2, 1e-300)
-            path = jnp.stack([ridges, _loo_path(Q, S, QtC, C - start, weight, ridges, intercept)], 1)
-            chosen = float(ridges[jnp.argmin(path[:, 1])])
-        else:
-            chosen = 1.0 if per_point is not None else float(ridge)  # type: ignore[arg-type]
-        matrix = (QtC.T * _shrink(S, chosen)) @ Pt * stretch
-        loo = float(_loo_path(Q, S, QtC, C - start, weight, jnp.array([chosen]), intercept)[0])
-        rank = int(jnp.sum(RANK_CUT * S[0] < S)) if float(S[0]) > 0 else 0
-        condition = float(S[0] / S[rank - 1]) if rank else 0.0
-        status = _status(S, rank, C.shape[1], condition, chosen)
-        used = float(jnp.mean(per_point)) if per_point is not None else chosen
-        M, d0, c0 = (part.astype(jnp.float32) for part in (matrix, offset, start))
-        return Transfer(M, d0, c0, used, S, condition, rank, loo, path, status)
+        M, offset, start, S, used, loo, path = _solve(measured, coefficients, weight, stretch, given, intercept)
+        values = np.asarray(S)
+    rank = int(np.sum(values > RANK_CUT * values[0])) if values[0] > 0 else 0
+    condition = float(values[0] / values[rank - 1]) if rank else 0.0
+    status = _status(values[0], rank, coefficients.shape[1], condition, float(used))
+    shown = float(np.mean(per_point)) if per_point is not None else float(used)
+    kept = path if ridge == "auto" else path[:0]
+    return Transfer(M, offset, start, shown, S, condition, rank, float(loo), kept, status)
 
 
-def _per_point(ridge: float | tuple[float, ...] | str, points: int) -> Array | None:
+@partial(jax.jit, static_argnames="intercept")
+def _solve(
+    measured: Array, coefficients: Array, weight: Array, stretch: Array, given: Array, intercept: bool
+) -> tuple[Array, ...]:
+    """One SVD, the whole leave-one-out path, and M at the ridge that is given (or, below 0, the best of the path)."""
+    X, C = measured.astype(jnp.float64), coefficients.astype(jnp.float64)
+    offset = jnp.mean(X, 0) if intercept else jnp.zeros(X.shape[1])
+    start = jnp.mean(C, 0) if intercept else jnp.zeros(C.shape[1])
+    Q, S, Pt = jnp.linalg.svd((X - offset) * stretch, full_matrices=False)
+    C = C - start
+    QtC = jnp.matmul(Q.T, C, precision="highest")
+    grid = jnp.concatenate([jnp.zeros(1), jnp.logspace(-13, 1, _RIDGES)]) * jnp.maximum(S[0] ** 2, 1e-300)
+    path = jax.lax.map(lambda ridge: _leave_one_out(Q, S, QtC, C, weight, ridge, intercept), grid)
+    chosen = jnp.where(given < 0, grid[jnp.argmin(path)], given)
+    matrix = jnp.matmul(QtC.T * _shrink(S, chosen), Pt, precision="highest") * stretch
+    loo = _leave_one_out(Q, S, QtC, C, weight, chosen, intercept)
+    M, d0, c0 = (part.astype(jnp.float32) for part in (matrix, offset, start))
+    return M, d0, c0, S, chosen, loo, jnp.stack([grid, path], 1)
+
+
+def _per_point(ridge: float | tuple[float, ...] | str, points: int) -> np.ndarray | None:
     if not isinstance(ridge, tuple):
         return None
     if len(ridge) != points:
         raise UserError(f"fit.ridge: got {len(ridge)} values, expected one per measurement ({points}), a number or auto")
     if min(ridge) <= 0:
         raise UserError(f"fit.ridge: got {min(ridge):g} for a point, expected all above 0; use 0 alone for the pseudo-inverse")
-    return jnp.array(ridge, jnp.float64)
+    return np.array(ridge)
 
 
-def _shrink(S: Array, ridge: Array | float) -> Array:
+def _shrink(S: Array, ridge: Array) -> Array:
     """S / (S² + ridge), where directions without signal get 0: at ridge 0 this is the pseudo-inverse."""
     held = RANK_CUT * S[0] < S
     return jnp.where(held | (ridge > 0), S / jnp.where(S**2 + ridge > 0, S**2 + ridge, 1), 0)
 
 
-@jax.jit
-def _loo_path(
-    Q: Array, S: Array, QtC: Array, C: Array, weight: Array, ridges: Array, intercept: bool | Array
-) -> Float[Array, " ridges"]:
-    """Leave-one-out residual of every ridge in closed form: e_k = (c_k - fitted_k) / (1 - h_kk)."""
-
-    def residual(ridge: Array) -> Array:
-        keep = S * _shrink(S, ridge)
-        leverage = (Q**2) @ keep + jnp.where(intercept, 1 / len(C), 0)
-        error = C - (Q * keep) @ QtC
-        # A row that alone decides its own fit (h = 1) says nothing about new ones: its error is its whole size.
-        free = 1 - leverage
-        left_out = jnp.where(free[:, None] > 1e-9, error / jnp.where(free > 1e-9, free, 1)[:, None], C)
-        return jnp.sqrt(jnp.sum(weight[:, None] * left_out**2) / jnp.sum(weight))
-
-    return jax.lax.map(residual, ridges)
+def _leave_one_out(Q: Array, S: Array, QtC: Array, C: Array, weight: Array, ridge: Array, intercept: bool) -> Array:
+    """Weighted root mean square of e_k = (c_k - fitted_k) / (1 - h_kk)."""
+    keep = S * _shrink(S, ridge)
+    free = 1 - jnp.matmul(Q**2, keep, precision="highest") - (1 / len(C) if intercept else 0)
+    error = C - jnp.matmul(Q * keep, QtC, precision="highest")
+    # A row that alone decides its own fit (h = 1) says nothing about new ones: its error is its whole size.
+    left_out = jnp.where(free[:, None] > 1e-9, error / jnp.where(free > 1e-9, free, 1)[:, None], C)
+    return jnp.sqrt(jnp.sum(weight[:, None] * left_out**2) / jnp.sum(weight))
 
 
 def _status(
-    S: Array, rank: int, bases: int, condition: float, ridge: float
+    largest: float, rank: int, bases: int, condition: float, ridge: float
 ) -> Literal["ok", "rank_deficient", "ill_conditioned", "no_signal"]:
     if rank == 0:
         return "no_signal"
     if rank < bases:
         return "rank_deficient"
-    held = ridge > (float(S[0]) / ILL_CONDITIONED) ** 2
+    held = ridge > (largest / ILL_CONDITIONED) ** 2
     return "ill_conditioned" if condition > ILL_CONDITIONED and not held else "ok"

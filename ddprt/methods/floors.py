@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import ClassVar
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -40,10 +41,15 @@ class MeanLightmap(Method):
 
     def fit(self, train: Examples, validation: Examples, *, key: Array) -> MeanMap:
         """See `Method`."""
-        weight = train.scale**2
-        total = jnp.sum(weight, 0)
-        mean = jnp.einsum("lc,ltc->tc", weight / jnp.where(total > 0, total, 1), train.indirect, precision="highest")
-        return MeanMap(mean, FitReport("ok" if bool((total > 0).any()) else "no_signal"))
+        mean = _weighted_mean(train.scale, train.indirect)
+        return MeanMap(mean, FitReport("ok" if bool((train.scale > 0).any()) else "no_signal"))
+
+
+@jax.jit
+def _weighted_mean(scale: Array, indirect: Array) -> Array:
+    weight = (scale / jnp.maximum(jnp.max(scale, 0), jnp.finfo(jnp.float32).tiny)) ** 2
+    total = jnp.sum(weight, 0)
+    return jnp.einsum("lc,ltc->tc", weight / jnp.where(total > 0, total, 1), indirect, precision="highest")
 
 
 @as_pytree

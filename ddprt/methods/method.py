@@ -27,6 +27,7 @@ STATUSES = {
     'Use ridge = "auto" or points further apart.',
     "no_signal": "Nothing was measured or no indirect light exists; the result is black. Check that lamps reach the scene and "
     "that its surfaces face each other.",
+    "diverged": "Training met numbers that are not finite; the weights from before are kept. Lower the learning rate.",
     "worse_than_mean": "On the validation lightings this method does worse than the mean lightmap. More training lightings or "
     "steps may help; do not ship it.",
 }

@@ -4,6 +4,7 @@ Same basis, same split and same metrics as the baseline, so the comparison exist
 """
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import ClassVar
 
 import jax
@@ -14,7 +15,7 @@ from jaxtyping import Array, Float
 from pydantic import Field
 
 from ddprt.fitting.basis import entry_weights, fit_basis
-from ddprt.methods.method import Examples, FitReport, Frame, Method, array_bytes, as_pytree, columns, measurements, static
+from ddprt.methods.method import Examples, FitReport, Frame, Method, array_bytes, as_pytree, columns, static
 
 Layers = tuple[tuple[Float[Array, "_ _"], Float[Array, " _"]], ...]
 
@@ -68,46 +69,42 @@ class Mlp(Method):
         rows, _ = columns(train)
         entries = jnp.asarray(entry_weights(train.area, train.weights, train.channels))  # type: ignore[arg-type]
         basis = fit_basis(rows, entries, bases=self.bases)
-        inputs, targets, importance = _pairs(train, basis.vectors, entries)
-        spread = jnp.maximum(jnp.sqrt(jnp.mean(targets**2, (0, 1))), 1e-12)
-        checked = _pairs(validation, basis.vectors, entries)
-        layers = self._initial(inputs.shape[1] + inputs.shape[2], len(spread), key)
-        optimiser = optax.chain(
-            optax.clip_by_global_norm(1.0),
-            optax.adamw(optax.cosine_decay_schedule(self.learning_rate, self.steps), weight_decay=self.weight_decay),
-        )
-        rounds = max(1, self.steps // self.check_every)
-        layers, losses = _train(
-            layers, (inputs, targets / spread, importance), (checked[0], checked[1] / spread, checked[2]), spread, optimiser,
-            rounds, min(self.check_every, self.steps),
-        )  # fmt: skip
+        groups = 3 if train.channels == "mono" else 1
+        data = tuple((e.frame.values, e.indirect, e.scale) for e in (train, validation))
+        layers, spread, losses = _train(self, groups, *data, basis.vectors, entries, key)
         history = tuple((int(i + 1) * self.check_every, float(a), float(b)) for i, (a, b) in enumerate(np.asarray(losses)))
         finite = all(np.isfinite(row).all() for row in history)
         report = FitReport(
-            status="no_signal" if basis.rank == 0 else basis.status if finite else "worse_than_mean",
+            status="no_signal" if basis.rank == 0 else basis.status if finite else "diverged",
             bases=len(spread),
             numerical_rank=basis.rank,
             singular_values=tuple(np.asarray(basis.singular_values).tolist()),
             loss=history,
         )
         weights, biases = zip(*layers, strict=True)
-        return Perceptron(weights, biases, basis.vectors, spread, inputs.shape[1], report)
+        return Perceptron(weights, biases, basis.vectors, spread, groups, report)
 
-    def _initial(self, inputs: int, outputs: int, key: Array) -> Layers:
+    def initial(self, inputs: int, outputs: int, key: Array) -> Layers:
+        """He-normal weights, zero biases."""
         sizes = [inputs, *[self.width] * self.depth, outputs]
         keys = jax.random.split(key, len(sizes) - 1)
         start = jax.nn.initializers.he_normal()
         return tuple((start(k, (a, b), jnp.float32), jnp.zeros(b)) for k, a, b in zip(keys, sizes[:-1], sizes[1:], strict=True))
 
+    def optimiser(self) -> optax.GradientTransformation:
+        """Clipped AdamW under a cosine schedule."""
+        rate = optax.cosine_decay_schedule(self.learning_rate, self.steps)
+        return optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(rate, weight_decay=self.weight_decay))
 
-def _pairs(examples: Examples, vectors: Array, entries: Array) -> tuple[Array, Array, Array]:
+
+def _pairs(groups: int, data: tuple[Array, Array, Array], vectors: Array, entries: Array) -> tuple[Array, Array, Array]:
     """(lightings, groups, inputs), (lightings, groups, bases) and (lightings, groups) importance, mean 1."""
-    inputs = jnp.moveaxis(measurements(examples), 0, 1)
-    light = examples.indirect
-    rows = jnp.moveaxis(light, 2, 1) if inputs.shape[1] == 3 else light.reshape(len(light), 1, -1)
+    values, light, scale = data
+    inputs = jnp.moveaxis(values, 2, 1) if groups == 3 else values.reshape(len(values), 1, -1)
+    rows = jnp.moveaxis(light, 2, 1) if groups == 3 else light.reshape(len(light), 1, -1)
     targets = jnp.matmul(rows * entries, vectors.T, precision="highest")
-    importance = examples.scale[:, : inputs.shape[1]] ** 2
-    return inputs, targets, importance / jnp.maximum(jnp.mean(importance), 1e-30)
+    share = (scale[:, :groups] / jnp.maximum(jnp.max(scale), jnp.finfo(jnp.float32).tiny)) ** 2
+    return inputs, targets, share / jnp.maximum(jnp.mean(share), jnp.finfo(jnp.float32).tiny)
 
 
 def _forward(layers: Layers, values: Float[Array, "frames groups inputs"]) -> Float[Array, "frames groups bases"]:
@@ -121,39 +118,40 @@ def _forward(layers: Layers, values: Float[Array, "frames groups inputs"]) -> Fl
     return hidden @ weight + bias
 
 
+@partial(jax.jit, static_argnums=(0, 1))
 def _train(
-    layers: Layers,
+    method: Mlp,
+    groups: int,
     train: tuple[Array, Array, Array],
     validation: tuple[Array, Array, Array],
-    spread: Array,
-    optimiser: optax.GradientTransformation,
-    rounds: int,
-    steps: int,
-) -> tuple[Layers, Array]:
-    """All of training as one compiled loop; returns the best layers and (train, validation) loss per round."""
+    vectors: Array,
+    entries: Array,
+    key: Array,
+) -> tuple[Layers, Array, Array]:
+    """All of training as one compiled loop: the best layers, the spread of coefficients, and losses per round."""
+    inputs, targets, importance = _pairs(groups, train, vectors, entries)
+    spread = jnp.maximum(jnp.sqrt(jnp.mean(targets**2, (0, 1))), 1e-12)
+    checked, wanted, checked_importance = _pairs(groups, validation, vectors, entries)
     share = spread**2 / jnp.sum(spread**2)
+    optimiser = method.optimiser()
 
-    def loss(layers: Layers, data: tuple[Array, Array, Array]) -> Array:
-        inputs, targets, importance = data
-        return jnp.mean(importance[..., None] * share * (_forward(layers, inputs) - targets) ** 2)
+    def loss(layers: Layers, inputs: Array, targets: Array, importance: Array) -> Array:
+        return jnp.mean(importance[..., None] * share * (_forward(layers, inputs) - targets / spread) ** 2)
 
-    def step(state: tuple[Layers, optax.OptState], _: None) -> tuple[tuple[Layers, optax.OptState], None]:
-        layers, optimiser_state = state
-        updates, optimiser_state = optimiser.update(jax.grad(loss)(layers, train), optimiser_state, layers)
-        return (optax.apply_updates(layers, updates), optimiser_state), None
+    def step(state: tuple, _: None) -> tuple[tuple, None]:
+        layers, memory = state
+        updates, memory = optimiser.update(jax.grad(loss)(layers, inputs, targets, importance), memory, layers)
+        return (optax.apply_updates(layers, updates), memory), None
 
     def one_round(carry: tuple, _: None) -> tuple[tuple, Array]:
         state, best, lowest = carry
-        state, _ = jax.lax.scan(step, state, None, length=steps)
-        now = loss(state[0], validation)
+        state, _ = jax.lax.scan(step, state, None, length=min(method.check_every, method.steps))
+        now = loss(state[0], checked, wanted, checked_importance)
         better = now < lowest
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), state[0], best)
-        return (state, best, jnp.where(better, now, lowest)), jnp.stack([loss(state[0], train), now])
+        return (state, best, jnp.where(better, now, lowest)), jnp.stack([loss(state[0], inputs, targets, importance), now])
 
-    @jax.jit
-    def run(layers: Layers) -> tuple[Layers, Array]:
-        start = ((layers, optimiser.init(layers)), layers, jnp.inf)
-        (_, best, _), losses = jax.lax.scan(one_round, start, None, length=rounds)
-        return best, losses
-
-    return run(layers)
+    layers = method.initial(groups + inputs.shape[2], len(spread), key)
+    start = ((layers, optimiser.init(layers)), layers, jnp.inf)
+    (_, best, _), losses = jax.lax.scan(one_round, start, None, length=max(1, method.steps // method.check_every))
+    return best, spread, losses

@@ -75,18 +75,21 @@ class SvdRidge(Method):
         basis = fit_basis(rows, entries, bases=max(self.bases - centre, 1), centre=centre)
         per_group = _spread(basis.coefficients, train, basis.vectors.shape[0])
         transfers: list[Transfer | None] = []
-        for group, inputs in enumerate(measurements(train)):
-            importance = train.scale[:, group] ** 2
-            lit = np.flatnonzero(np.asarray(importance) > 0)
+        scale = np.asarray(train.scale)
+        relative = scale / max(
+            float(scale.max(initial=0)), np.finfo(np.float32).tiny
+        )  # squares then neither over- nor underflow
+        for group, inputs in enumerate(np.asarray(measurements(train))):
+            lit = np.flatnonzero(scale[:, group] > 0)
             if len(lit) == 0:
                 transfers.append(None)
                 continue
             transfers.append(
                 fit_transfer(
-                    inputs[lit],
+                    jnp.asarray(inputs[lit]),
                     jnp.asarray(per_group[group][lit]),
                     ridge=self.ridge,
-                    importance=importance[lit],
+                    importance=jnp.asarray(np.maximum(relative[lit, group].astype(np.float64), 1e-150) ** 2),
                     intercept=centre,
                 )
             )

@@ -5,19 +5,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import jax.numpy as jnp
+import jax
 import numpy as np
+from jaxtyping import Array
 
 from ddprt import seeds
 from ddprt.config import Config
 from ddprt.dataset.store import Dataset
 from ddprt.fitting.basis import entry_weights
+from ddprt.fitting.encoding import Encoding
 from ddprt.report.metrics import Truth, negative_share, z_scores
 from ddprt.runtime.model import Model
 from ddprt.runtime.train import fit_method
 from ddprt.scene.mesh import Scene
-
-_REPEATS = 5
 
 
 @dataclass
@@ -56,14 +56,14 @@ def evaluate(data: Dataset, models: Mapping[str, Model], fit_seconds: Mapping[st
     predicted, scores, values = {}, {}, np.zeros((0, 0, 3))
     for name, model in models.items():
         values = data.values(test, model.points, model.quantity)
-        unclamped = model.predict(values, clamp=False)
+        unclamped, relight_seconds = _frame_by_frame(model, values)
         predicted[name] = np.maximum(unclamped, 0)  # the clamp commutes with decoding, which is odd and rising
         report = model.relighter.report
         scores[name] = {
             **truth.scores(predicted[name]),
             "negative_share": negative_share(unclamped, truth.weight),
             "fit_seconds": fit_seconds.get(name, 0.0),
-            "relight_seconds": _relight_seconds(model, values),
+            "relight_seconds": relight_seconds,
             "bytes": model.relighter.nbytes,
             "flops": model.relighter.flops,
             "bases": report.bases,
@@ -102,8 +102,9 @@ def projection_error(data: Dataset, model: Model, truth: Truth, bases: int | Non
         return None
     vectors = np.asarray(basis, np.float64)[:bases]
     mono = vectors.shape[1] == len(truth.weight)
-    scale = model.encoding.scale(jnp.asarray(data.values(data.split("test"), model.points, model.quantity)))
-    encoded = np.asarray(model.encoding.encode(jnp.asarray(truth.reference), scale), np.float64)
+    measured = data.values(data.split("test"), model.points, model.quantity)
+    scale, encoded = _encoded(model.encoding, measured, truth.reference)
+    encoded = np.asarray(encoded, np.float64)
     rows = np.moveaxis(encoded, 2, 1) if mono else encoded.reshape(len(encoded), 1, -1)
     mean = np.asarray(getattr(model.relighter, "mean", 0.0), np.float64)
     weights = entry_weights(data.area, "area", "mono" if mono else "multi").astype(np.float64)
@@ -112,8 +113,19 @@ def projection_error(data: Dataset, model: Model, truth: Truth, bases: int | Non
     coefficients = np.linalg.solve(gram, (((rows - mean) * weights) @ vectors.T).reshape(-1, len(vectors)).T).T
     light = coefficients.reshape(*rows.shape[:2], -1) @ vectors + mean
     back = np.moveaxis(light, 1, 2) if mono else light.reshape(encoded.shape)
-    decoded = np.asarray(model.encoding.decode(jnp.asarray(back, jnp.float32), scale))
+    decoded = np.asarray(_decoded(model.encoding, back.astype(np.float32), scale))
     return truth.relative_rmse(decoded - truth.reference)
+
+
+@jax.jit
+def _encoded(encoding: Encoding, measured: Array, light: Array) -> tuple[Array, Array]:
+    scale = encoding.scale(measured)
+    return scale, encoding.encode(light, scale)
+
+
+@jax.jit
+def _decoded(encoding: Encoding, light: Array, scale: Array) -> Array:
+    return encoding.decode(light, scale)
 
 
 def bases_curve(data: Dataset, config: Config, truth: Truth) -> list[tuple[int, float, float]]:
@@ -131,7 +143,7 @@ def bases_curve(data: Dataset, config: Config, truth: Truth) -> list[tuple[int, 
     rows = []
     for bases in sorted({min(bases, whole) for bases in config.report.bases_curve if bases > has_mean}):
         shorter = replace(model, relighter=model.relighter.truncated(bases - has_mean))  # type: ignore[attr-defined]
-        error = truth.relative_rmse(shorter.predict(values) - truth.reference)
+        error = truth.relative_rmse(np.maximum(_frame_by_frame(shorter, values)[0], 0) - truth.reference)
         floor = projection_error(data, model, truth, bases - has_mean)
         if error is not None and floor is not None:
             rows.append((bases, error, floor))
@@ -194,15 +206,15 @@ def _pooled_variance(baked: np.ndarray, noise: np.ndarray) -> np.ndarray:
     return share * baked**2
 
 
-def _relight_seconds(model: Model, values: np.ndarray) -> float:
-    """Median seconds of one frame through the public API, compiled before."""
-    model.predict(values[0])
-    times = []
-    for _ in range(_REPEATS):
+def _frame_by_frame(model: Model, values: np.ndarray) -> tuple[np.ndarray, float]:
+    """Unclamped prediction of every frame through the public API, and the median seconds of one, compiled before."""
+    model.predict(values[0], clamp=False)
+    light, seconds = [], []
+    for frame in values:
         start = time.perf_counter()
-        model.predict(values[0])
-        times.append(time.perf_counter() - start)
-    return float(np.median(times))
+        light.append(model.predict(frame, clamp=False))
+        seconds.append(time.perf_counter() - start)
+    return np.stack(light), float(np.median(seconds))
 
 
 def _distance_to_surface(data: Dataset, model: Model, indices: list[int]) -> np.ndarray:

@@ -57,6 +57,7 @@ def write_page(
     stages: Sequence[Mapping[str, Any]] = (),
     scene: Scene | None = None,
     plan_effects: Sequence[Effect] | None = None,
+    effect_costs: Mapping[str, Mapping[str, Any]] | None = None,
     command: str = "",
 ) -> Path:
     """Writes the report.
@@ -70,6 +71,7 @@ def write_page(
       stages: of the run, each {"name", "seconds", ...facts}; "rays" is shown as a rate too.
       scene: what was baked; without it the pictures are lightmaps alone.
       plan_effects: the plan's effects; None takes those that the dataset was baked with.
+      effect_costs: rays, seconds and energy_share by name of the effect, where they are known.
       command: that makes this report again.
     Returns:
       The path.
@@ -108,6 +110,7 @@ def write_page(
         plots=figures.plots(evaluation, {name: model.relighter.report for name, model in models.items()}, main),
         check=evaluation.spot_check,
         effects=effects,
+        costs=effect_costs or {},
         stages=[dict(stage) for stage in stages],
         command=command,
         **_pictures(evaluation, data, main, models[main], config, scene),

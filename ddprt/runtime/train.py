@@ -2,17 +2,20 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from ddprt import seeds
 from ddprt.config import Config, FitConfig
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.fitting.encoding import Encoding
+from ddprt.lights import Lighting
 from ddprt.methods import make_method
 from ddprt.methods.floors import MeanLightmap
 from ddprt.methods.method import Examples, Frame, Relighter
@@ -98,31 +101,51 @@ def fit_method(
 def _judged(relighter: Relighter, encoding: Encoding, train: Examples, validation: Examples) -> Relighter:
     """The law that a method beats the mean lightmap on its validation set, or says that it does not."""
     mean = MeanLightmap().fit(train, validation, key=jax.random.key(0))
-    weights = jnp.asarray(validation.area / validation.area.sum(), jnp.float32)
-    truth = encoding.decode(validation.indirect, validation.scale)
-
-    def error(candidate: Relighter) -> float:
-        light = encoding.decode(candidate.predict(validation.frame), validation.scale)
-        return float(jnp.einsum("ltc,t->", (light - truth) ** 2, weights))
-
-    if relighter.report.status != "ok" or error(relighter) <= error(mean):
+    frame = validation.frame
+    area = jnp.asarray(validation.area / validation.area.sum(), jnp.float32)
+    data = frame.values, frame.positions, frame.normals, validation.indirect, validation.scale, area
+    lightings = None if frame.lightings is None else tuple(frame.lightings)
+    if relighter.report.status != "ok" or float(_squared_error(relighter, encoding, *data, lightings)) <= float(
+        _squared_error(mean, encoding, *data, lightings)
+    ):
         return relighter
     return replace(relighter, report=replace(relighter.report, status="worse_than_mean"))  # type: ignore[type-var]
+
+
+@partial(jax.jit, static_argnames="lightings")
+def _squared_error(
+    relighter: Relighter,
+    encoding: Encoding,
+    values: Array,
+    positions: Array,
+    normals: Array,
+    indirect: Array,
+    scale: Array,
+    area: Array,
+    lightings: tuple[Lighting, ...] | None,
+) -> Array:
+    light = relighter.predict(Frame(values, positions, normals, lightings))
+    difference = encoding.decode(light, scale) - encoding.decode(indirect, scale)
+    return jnp.einsum("ltc,t->", difference**2, area)
 
 
 def examples(data: Dataset, split: str, encoding: Encoding, config: FitConfig, points: int, quantity: str) -> Examples:
     """Scaled and encoded pairs of a split: here arrays pass from NumPy to JAX."""
     indices = data.split(split)
-    values = jnp.asarray(data.values(indices, points, quantity))
-    scale = encoding.scale(values)
+    values, scale, indirect = _encoded(encoding, data.values(indices, points, quantity), data.maps("indirect", indices))
     frame = Frame(
-        encoding.encode(values, scale),
+        values,
         jnp.asarray(data.samples.position[:points], jnp.float32),
         jnp.asarray(data.samples.normal[:points], jnp.float32),
         [data.lightings[index] for index in indices],
     )
-    indirect = encoding.encode(jnp.asarray(data.maps("indirect", indices)), scale)
     return Examples(frame, indirect, scale, np.asarray(data.area, np.float32), config.weights, config.channels)
+
+
+@jax.jit
+def _encoded(encoding: Encoding, values: Array, indirect: Array) -> tuple[Array, Array, Array]:
+    scale = encoding.scale(values)
+    return encoding.encode(values, scale), scale, encoding.encode(indirect, scale)
 
 
 def fit_config(data: Dataset, config: Config, name: str) -> Model:
