@@ -217,6 +217,13 @@ def test_dark_and_blocked_lightings_are_named(cornell: Scene, capsys: pytest.Cap
 def test_all_dark_is_an_error(records: tuple, cornell: Scene, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="all 3 light nothing"):
         bake(cornell, lightings(*records), config=small(), out=tmp_path / "dataset")
+    bake(cornell, lightings(LAMP, LAMP, LAMP), config=small(), out=tmp_path / "dataset")  # nothing is in the way
+
+
+def test_a_refused_bake_is_not_in_the_way_of_the_next(cornell: Scene, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"lower points\.count"):
+        bake(cornell, config=small(points={"count": 5000}), out=tmp_path / "dataset")
+    bake(cornell, config=small(), out=tmp_path / "dataset")
 
 
 def test_too_few_lightings_or_points(cornell: Scene, tmp_path: Path) -> None:

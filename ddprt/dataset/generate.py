@@ -4,6 +4,7 @@ What a stage needs is read back from the files of the stage before it, never fro
 gives the same bits as one that was never stopped.
 """
 
+import shutil
 import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -82,18 +83,19 @@ class _Bake:
             entries, drawn = choose_lightings(given, self.config.lightings, self.scene, self.tracer, self.config.seed)
             stage.facts |= {"lightings": len(entries), **drawn}
         effects = plan(self.scene, [lighting for _, lighting in entries], bounces=self.config.transport.bounces)
-        description = self._description(entries, effects, drawn)
-        self._claim(description)
-        manifest = Manifest(self.folder)
         with self.progress.stage("atlas") as stage:
             atlas = build_atlas(self.scene, self.config.atlas.resolution, self.config.atlas.padding)
             stage.facts |= {"texels": atlas.count, "texels_per_metre": round(atlas.texels_per_metre, 3)}
         with self.progress.stage("points") as stage:
-            samples = self._samples(manifest, atlas)
+            samples = self._samples(atlas)
             stage.facts["samples"] = len(samples.position)
+        description = self._description(entries, effects, drawn)
+        fresh = self._claim(description)
+        manifest = Manifest(self.folder)
+        self._write_places(manifest, atlas, samples)
         dataset = Dataset(self.folder, description, keep_alive)
         self._direct(dataset, manifest, atlas, samples)
-        self._judge_lightings(dataset)
+        self._judge_lightings(dataset, fresh)
         self._indirect(dataset, manifest, atlas, effects, "train", dataset.split("train") + dataset.split("validation"))
         self._indirect(dataset, manifest, atlas, effects, "test", dataset.split("test"))
         return dataset
@@ -119,11 +121,11 @@ class _Bake:
     def _integrator(self) -> str:
         return "operator" if self.config.transport.integrator == "auto" else self.config.transport.integrator
 
-    def _claim(self, description: dict[str, Any]) -> None:
-        """Writes dataset.json, or makes sure that what lies there is this very bake."""
+    def _claim(self, description: dict[str, Any]) -> bool:
+        """Writes dataset.json (True), or makes sure that what lies there is this very bake (False)."""
         if not (self.folder / "dataset.json").exists():
             store.write_description(self.folder, description)
-            return
+            return True
         there = store.read_description(self.folder)
         differs = [key for key in description if key != "ddprt" and there.get(key) != description[key]]
         if differs:
@@ -132,8 +134,9 @@ class _Bake:
                 f'{self.folder}: holds another dataset (scene "{name}"; {", ".join(differs)} differ); '
                 "choose another --out, or delete that folder"
             )
+        return False
 
-    def _samples(self, manifest: Manifest, atlas: Atlas) -> Samples:
+    def _samples(self, atlas: Atlas) -> Samples:
         config = self.config.points
         if config.file:
             samples = load_samples(config.file)
@@ -146,6 +149,10 @@ class _Bake:
                     "lower points.count or raise atlas.resolution"
                 )
             samples = place_samples(self.scene, config.count * config.supersample, on=config.on, seed=self.config.seed)
+        return samples
+
+    def _write_places(self, manifest: Manifest, atlas: Atlas, samples: Samples) -> None:
+        """Points, occluders and the G-buffer, unless they are there."""
         if not manifest.holds("points.safetensors"):
             tensors = {"position": samples.position, "normal": samples.normal, "albedo": samples.albedo}
             write_tensors(self.folder / "points.safetensors", {**tensors, "spacing": np.array([samples.spacing])})
@@ -155,7 +162,6 @@ class _Bake:
             manifest.add("scene.safetensors")
         if not all(manifest.holds(f"atlas/{name}.exr") for name in ("position", "coverage")):
             store.write_atlas(self.folder, atlas, manifest)
-        return samples
 
     def _direct(self, dataset: Dataset, manifest: Manifest, atlas: Atlas, samples: Samples) -> None:
         """Direct lightmaps and measured values, a lighting per task."""
@@ -186,7 +192,7 @@ class _Bake:
                 stage.advance()
             stage.facts["rays"] = self.tracer.rays - before
 
-    def _judge_lightings(self, dataset: Dataset) -> None:
+    def _judge_lightings(self, dataset: Dataset, fresh: bool) -> None:
         """Names lightings that light nothing or stand where no lamp should, and why; refuses a bake of darkness."""
         faults, dark = [], 0
         for index, lighting in enumerate(dataset.lightings):
@@ -196,6 +202,8 @@ class _Bake:
             if why:
                 faults.append(f"{index} ({dataset.description['lightings'][index]['split']}): {why}")
         if dark == len(dataset.lightings):
+            if fresh:  # nothing in it is worth keeping, and it would be in the way of the next try
+                shutil.rmtree(self.folder)
             raise UserError(
                 f"lightings: all {dark} light nothing, expected light on the scene; the first: {faults[0]}; "
                 "check positions, directions and intensities"

@@ -75,12 +75,9 @@ class SvdRidge(Method):
         basis = fit_basis(rows, entries, bases=max(self.bases - centre, 1), centre=centre)
         per_group = _spread(basis.coefficients, train, basis.vectors.shape[0])
         transfers: list[Transfer | None] = []
-        scale = np.asarray(train.scale)
-        relative = scale / max(
-            float(scale.max(initial=0)), np.finfo(np.float32).tiny
-        )  # squares then neither over- nor underflow
         for group, inputs in enumerate(np.asarray(measurements(train))):
-            lit = np.flatnonzero(scale[:, group] > 0)
+            scale = np.asarray(train.scale[:, group])
+            lit = np.flatnonzero(scale > 0)
             if len(lit) == 0:
                 transfers.append(None)
                 continue
@@ -89,7 +86,7 @@ class SvdRidge(Method):
                     jnp.asarray(inputs[lit]),
                     jnp.asarray(per_group[group][lit]),
                     ridge=self.ridge,
-                    importance=jnp.asarray(np.maximum(relative[lit, group].astype(np.float64), 1e-150) ** 2),
+                    importance=jnp.asarray((scale[lit] / scale.max()) ** 2),  # relative: squares do not overflow
                     intercept=centre,
                 )
             )
