@@ -103,14 +103,23 @@ def relight(call: Call) -> None:
     model = load_model(call.file("a model folder such as runs/cornell/model.ddprt"))
     if source.lstrip().startswith(("[", "{")):
         try:
-            lightings = [parse_lighting(json.loads(source), "--lighting")]
-        except json.JSONDecodeError as error:
+            records = json.loads(source)
+            several = isinstance(records, list) and bool(records) and isinstance(records[0], list)
+            lightings = [parse_lighting(entry, "--lighting") for entry in (records if several else [records])]
+        except (json.JSONDecodeError, RecursionError) as error:
             raise UserError(f"--lighting: not JSON: {error}") from None
     else:
         lightings = load_lightings(source)
     for index, lighting in enumerate(lightings):
         path = out if len(lightings) == 1 else out.with_stem(f"{out.stem}_{index:03d}")
-        write_exr(path, model.relight(lighting))
+        image = model.relight(lighting)
+        if not image.any():
+            print(
+                f"warning: lighting {index} lights no measurement point, so {path} is black; its lamps may stand "
+                "inside a solid, outside the scene, face away or have no intensity",
+                file=sys.stderr,
+            )
+        write_exr(path, image)
         print(f"lightmap: {path}")
 
 

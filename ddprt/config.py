@@ -59,7 +59,9 @@ class LightingsConfig(Section):
     clearance: float = Field(0.05, ge=0.0, description="room: metres to keep from every surface")
     distance: Range = Field((1.5, 3.0), description="around: distance from the asset's centre in bounding radii")
     elevation_deg: Range = Field((0.0, 90.0), description="around: height above the horizon")
-    intensity: Range = Field((1.0, 1.0), description="W/sr of a lamp at each end of a log-uniform range")
+    intensity: tuple[Annotated[float, Field(gt=0, le=1e25)], Annotated[float, Field(gt=0, le=1e25)]] = Field(
+        (1.0, 1.0), description="W/sr of a lamp at each end of a log-uniform range"
+    )
     saturation: Range = Field((0.0, 0.0), description="0 is white, 1 a fully saturated random hue")
     spot_outer_deg: Range = Field((25.0, 50.0), description="half-angle of a spot's cone; the inner cone is 0.6 of it")
     size: float = Field(0.05, gt=0.0, description="area lights: half-edge or radius, as a fraction of the bounding radius")
@@ -72,8 +74,6 @@ class LightingsConfig(Section):
                 raise ValueError(f"{name}: got [{low}, {high}], expected the lower end first")
         if self.lights[0] < 1:
             raise ValueError(f"lights: got {self.lights[0]}, expected at least 1")
-        if self.intensity[0] <= 0:
-            raise ValueError(f"intensity: got {self.intensity[0]}, expected more than 0")
         if not 0 <= self.saturation[0] <= self.saturation[1] <= 1:
             raise ValueError("saturation: expected both ends between 0 and 1")
         if not 0 < self.spot_outer_deg[0] <= self.spot_outer_deg[1] < 90:
@@ -117,6 +117,7 @@ class FitConfig(Section):
     """From pairs to a runtime."""
 
     method: str = Field("svd-ridge", description="entry of METHODS that is saved and exported")
+    points: int = Field(0, ge=0, description="measurement points to use; 0: all that were baked")
     bases: int = Field(16, ge=1, description="basis vectors, the mean counted in where there is one")
     space: Literal["linear", "gamma"] = Field("linear", description="where transfer happens")
     gamma: float = Field(2.2, ge=1.0, le=10.0, description="exponent of the gamma space")
@@ -139,7 +140,9 @@ class ReportConfig(Section):
     """What the report shows."""
 
     rows: int = Field(4, ge=1, le=64, description="held-out lightings shown as pictures")
-    bases_curve: tuple[int, ...] = Field((4, 8, 16, 32, 64), description="numbers of bases on the error curve")
+    bases_curve: tuple[Annotated[int, Field(ge=1)], ...] = Field(
+        (4, 8, 16, 32, 64), min_length=1, description="numbers of bases on the error curve"
+    )
     spot_check_texels: int = Field(256, ge=0, description="texels checked against the reference integrator; 0 skips")
     spot_check_lightings: int = Field(4, ge=1, description="held-out lightings checked there")
     spot_check_samples: int = Field(512, ge=2, description="paths per texel of that check")

@@ -11,7 +11,7 @@ import numpy as np
 
 from ddprt import __version__
 from ddprt.config import Config
-from ddprt.dataset.generate import bake
+from ddprt.dataset.generate import bake, other_settings
 from ddprt.dataset.store import Dataset, open_dataset
 from ddprt.errors import UserError
 from ddprt.files import make_folder, write_text
@@ -82,11 +82,12 @@ class Run:
         if not (self.folder / "dataset" / "dataset.json").is_file():
             raise UserError(f"{self.folder}: got no dataset, expected a run folder; run `ddprt bake` with the same --out first")
         data = open_dataset(self.folder / "dataset")
-        there, atlas = data.description["scene"], data.description["atlas"]
-        if there["digest"] != self.scene.digest or atlas != self.config.atlas.model_dump():
+        differs = other_settings(data.description, self.config, self.scene)
+        if differs:
+            name = data.description["scene"]["name"]
             raise UserError(
-                f'{self.folder}: got a dataset of scene "{there["name"]}" at {atlas["resolution"]}², expected '
-                f'"{self.scene.name}" at {self.config.atlas.resolution}² as it is now; bake again into another --out'
+                f'{self.folder}: got a dataset of scene "{name}" baked otherwise ({", ".join(differs)} differ), expected '
+                f'"{self.scene.name}" as configured now; bake again into another --out'
             )
         return data
 

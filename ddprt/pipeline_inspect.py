@@ -16,6 +16,7 @@ def describe(source: str, overrides: dict[str, str]) -> str:
       source: a configuration, a scene name or a mesh file.
       overrides: of the configuration.
     """
+    from ddprt.lights import Lighting
     from ddprt.sampling.lightings import draw_lightings
     from ddprt.scene.atlas import build_atlas
     from ddprt.scene.files import load_scene
@@ -42,31 +43,25 @@ def describe(source: str, overrides: dict[str, str]) -> str:
         f"({100 * atlas.count / atlas.resolution**2:.0f} %), {charts} charts, {atlas.texels_per_metre:.4g} texels per metre"
     )
     tracer = Tracer.of(scene)
-    draw = draw_lightings(
-        config.lightings,
-        "train",
-        min(8, config.lightings.train),
-        bounds=scene.bounds,
-        clearance=tracer.clearance,
-        seed=config.seed,
-    )
-    lines.append(
-        f"lightings   {config.lightings.distribution}: {draw.candidates} positions tried, {draw.rejected} rejected (of 8 drawn)"
-    )
-    for effect in plan(scene, draw.lightings, bounces=config.transport.bounces).effects:
+    settings = config.lightings
+    lightings: tuple[Lighting, ...] = ()
+    drawn = min(8, settings.train)
+    try:
+        draw = draw_lightings(settings, "train", drawn, bounds=scene.bounds, clearance=tracer.clearance, seed=config.seed)
+        lightings = draw.lightings
+        tried = f"{draw.candidates} positions tried, {draw.rejected} rejected for the first {drawn}"
+        lines.append(f"lightings   {settings.distribution}: {tried}")
+    except UserError as error:  # an asset can be looked at before its lamps are configured
+        lines.append(f"lightings   cannot be drawn as configured: {error}")
+    for effect in plan(scene, lightings, bounces=config.transport.bounces).effects:
         state = "called for" if effect.called else "left out"
-        bound = (
-            ""
-            if effect.called
-            else f"; at most {'any amount' if effect.bound is None else f'{effect.bound:.2g}'} of the direct light"
-        )
+        most = "any amount" if effect.bound is None else f"{effect.bound:.2g}"
+        bound = "" if effect.called else f"; at most {most} of the direct light"
         lines.append(f"effect      {effect.name}: {state}{' (forced)' if effect.forced else ''}: {effect.why}{bound}")
-    lightings = config.lightings.train + config.lightings.validation + config.lightings.test
+    count = settings.train + settings.validation + settings.test
     gather = atlas.count * (config.transport.samples + config.transport.test_samples)
-    shadow = atlas.count * config.transport.direct_samples * lightings
-    lines.append(
-        f"a bake      {lightings} lightings: {gather / 1e6:.0f} M gather rays, {shadow / 1e6:.0f} M shadow rays per lamp"
-    )
+    shadow = atlas.count * config.transport.direct_samples * count
+    lines.append(f"a bake      {count} lightings: {gather / 1e6:.0f} M gather rays, {shadow / 1e6:.0f} M shadow rays per lamp")
     return "\n".join(lines)
 
 

@@ -24,7 +24,7 @@ def main(source: str = "configs/cornell.toml", *counts: str) -> None:
     print(f"noise floor {truth.relative_rmse(data.maps('noise', test)):.4f}")
     print("points  bases  transfer  projection  ratio")
     for points in numbers:
-        fewer = config.model_copy(update={"points": config.points.model_copy(update={"count": points})})
+        fewer = config.model_copy(update={"fit": config.fit.model_copy(update={"points": points})})
         for bases, error, floor in bases_curve(data, fewer, truth):
             print(f"{points:6d}  {bases:5d}  {error:8.4f}  {floor:10.4f}  {error / floor:5.3f}", flush=True)
 

@@ -224,6 +224,59 @@ def test_more_bases_than_rank_is_a_warning(job: Path, tmp_path: Path, capsys: py
     assert "warning: fit.bases: asked for 100, the data has rank 18: 18 are given" in capsys.readouterr().err
 
 
+DARK = {
+    "no bounce": ["--transport.bounces", "0"],
+    "lonely body": ["--scene.name", "convex", "--lightings.distribution", "around"],
+    "points that see no light": ["--points.on", "hull"],
+    "a network without light": ["--transport.bounces", "0", "--fit.method", "mlp"],
+    "black room": [
+        "--scene.name",
+        "furnace",
+        "--scene.parameters.albedo",
+        "0",
+        "--fit.centre",
+        "mean",
+        "--fit.channels",
+        "multi",
+    ],
+}
+
+
+@pytest.mark.parametrize("name", DARK)
+def test_darkness_is_a_status_and_a_black_result(name: str, job: Path, tmp_path: Path) -> None:
+    assert call("run", job, "--out", tmp_path / "run", "--quiet", *DARK[name]) == 0
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    method = "mlp" if "mlp" in DARK[name] else "svd-ridge"
+    assert metrics["methods"][method]["status"] == "no_signal"
+    assert (tmp_path / "run" / "report.html").stat().st_size > 1000
+
+
+def test_fewer_points_than_baked_and_what_is_refused(job: Path, done: Path, tmp_path: Path) -> None:
+    import shutil
+
+    shutil.copytree(done, tmp_path / "run")
+    assert call("fit", job, "--out", tmp_path / "run", "--quiet", "--fit.points", "4") == 0
+    assert call("run", tmp_path / "run" / "config.toml", "--quiet") == 0, "the configuration still fits the dataset"
+    for change in (["--points.count", "4"], ["--seed", "3"], ["--transport.samples", "9"], ["--lightings.train", "3"]):
+        assert call("fit", job, "--out", tmp_path / "run", "--quiet", *change) == 2
+
+
+def test_a_lamp_that_lights_nothing_is_said(done: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    lamp = '{"type": "point", "position": [0, 9, 0], "intensity": [1, 1, 1]}'
+    assert call("relight", done / "model.ddprt", "--lighting", lamp, "--out", tmp_path / "dark.exr") == 0
+    assert "lights no measurement point" in capsys.readouterr().err
+
+
+def test_export_leaves_no_stale_textures(job: Path, done: Path, tmp_path: Path) -> None:
+    import shutil
+
+    shutil.copytree(done, tmp_path / "run")
+    for bases, count in (("9", 3), ("3", 1)):
+        assert call("fit", job, "--out", tmp_path / "run", "--quiet", "--fit.bases", bases) == 0
+        assert call("export", job, "--out", tmp_path / "run", "--quiet", "--fit.bases", bases) == 0
+        assert len(list((tmp_path / "run" / "export").glob("basis_*.exr"))) == count
+
+
 def test_heartbeat_without_a_terminal(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     from ddprt.progress import Progress
 

@@ -200,6 +200,28 @@ def lightings(*records: dict) -> list:
     return [parse_lighting(record) for record in records]
 
 
+def test_changed_points_are_another_dataset(cornell: Scene, tmp_path: Path) -> None:
+    path = tmp_path / "points.json"
+    place = {"position": [0.3, 0.0, 0.05], "normal": [0, 1, 0]}
+    path.write_text(json.dumps([place] * 3))
+    config = small(points={"file": str(path), "count": 3})
+    bake(cornell, config=config, out=tmp_path / "dataset")
+    path.write_text(json.dumps([{**place, "position": [0.2, 0.0, 0.05]}] * 3))
+    with pytest.raises(UserError, match="holds another dataset"):
+        bake(cornell, config=config, out=tmp_path / "dataset")
+    path.write_text(json.dumps([{**place, "albedo": [-1, 0, 0]}] * 3))
+    with pytest.raises(UserError, match="expected 0 to 1"):
+        bake(cornell, config=config, out=tmp_path / "other")
+
+
+@pytest.mark.parametrize("name", ["position", "normal", "geometric_normal", "albedo", "area", "coverage"])
+def test_each_lost_atlas_file_is_made_again(name: str, baked: Path, cornell: Scene, tmp_path: Path) -> None:
+    shutil.copytree(baked, tmp_path / "dataset")
+    (tmp_path / "dataset" / "atlas" / f"{name}.exr").unlink()
+    bake(cornell, config=small(), out=tmp_path / "dataset")
+    assert files(tmp_path / "dataset")[f"atlas/{name}.exr"] == files(baked)[f"atlas/{name}.exr"]
+
+
 def test_dark_and_blocked_lightings_are_named(cornell: Scene, capsys: pytest.CaptureFixture) -> None:
     given = {"train": lightings(LAMP, OFF, OUTSIDE, IN_BLOCK), "validation": lightings(LAMP), "test": lightings(LAMP)}
     data = bake(cornell, given, config=small(), progress=Progress())

@@ -313,3 +313,23 @@ def test_bad_files_get_one_line(tmp_path: Path, content: str | bytes | None, mes
     with pytest.raises(UserError, match=message) as caught:
         load_lightings(path)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("length", [1e-300, 1e-46, 1e-25, 1.0, 1e20, 1e300])
+def test_directions_of_any_length_mean_the_same(length: float) -> None:
+    points, u = np.zeros((1, 3), np.float32), np.zeros((1, 2), np.float32)
+    for record in (
+        {"type": "directional", "irradiance": [1, 1, 1]},
+        {"type": "spot", "position": [0, 0, 1], "intensity": [1, 1, 1], "inner_deg": 5, "outer_deg": 60},
+    ):
+        expected, got = (
+            parse_lighting({**record, "direction": [0, 0.6 * size, -0.8 * size]})[0].illuminate(points, u)
+            for size in (1, length)
+        )
+        np.testing.assert_allclose(got.irradiance, expected.irradiance, rtol=1e-6)
+        np.testing.assert_allclose(got.direction, expected.direction, rtol=1e-6)
+
+
+def test_reading_a_direction_back_changes_nothing() -> None:
+    light = parse_lighting({"type": "directional", "direction": [0.3, -2.1, 0.7], "irradiance": [1, 1, 1]})
+    assert parse_lighting(lighting_json(light)) == light

@@ -84,6 +84,10 @@ def test_damaged_models_are_refused(saved: Path, tmp_path: Path) -> None:
         (json.dumps({**document, "schema": 7}), "got model schema 7"),
         (json.dumps({**document, "method": "magic"}), 'no method "magic"'),
         (json.dumps({**document, "points": {}}), "do not fit together"),
+        (json.dumps({key: value for key, value in document.items() if key != "method"}), "do not fit together"),
+        (json.dumps({**document, "points": {**document["points"], "count": 5}}), "do not fit together"),
+        (json.dumps({**document, "points": {**document["points"], "count": 0}}), "do not fit together"),
+        (json.dumps({**document, "encoding": {**document["encoding"], "space": "weird"}}), "do not fit together"),
     ):
         (saved / "model.json").write_text(change)
         with pytest.raises(UserError, match=expected):

@@ -16,7 +16,7 @@ import numpy as np
 from ddprt import __version__, seeds
 from ddprt.config import Config
 from ddprt.dataset import store
-from ddprt.dataset.splits import Splits, choose_lightings, doubt
+from ddprt.dataset.splits import SPLITS, Splits, choose_lightings, doubt
 from ddprt.dataset.store import Dataset, Manifest, map_name
 from ddprt.errors import UserError
 from ddprt.files import write_tensors
@@ -71,6 +71,28 @@ def bake(
     return _Bake(scene, config, folder, progress or Progress(quiet=True)).run(lightings, keep_alive)
 
 
+def baked_settings(config: Config, scene: Scene) -> dict[str, Any]:
+    """What a dataset depends on besides its lightings and points."""
+    transport = config.transport.model_dump(exclude={"threads"})
+    return {
+        "scene": {"name": scene.name, "digest": scene.digest, "notes": list(scene.notes)},
+        "atlas": config.atlas.model_dump(),
+        "seed": config.seed,
+        "transport": transport | {"integrator": "operator" if transport["integrator"] == "auto" else transport["integrator"]},
+        "placing": config.points.model_dump(exclude={"quantity"}),
+    }
+
+
+def other_settings(description: dict[str, Any], config: Config, scene: Scene) -> list[str]:
+    """Names of the settings in which a baked dataset differs from a configuration; empty where it is the same."""
+    wanted: dict[str, Any] = baked_settings(config, scene)
+    if not config.lightings.file:
+        splits = [entry["split"] for entry in description["lightings"]]
+        wanted["counts"] = {name: getattr(config.lightings, name) for name in SPLITS}
+        description = {**description, "counts": {name: splits.count(name) for name in SPLITS}}
+    return [name for name, value in wanted.items() if description.get(name) != value]
+
+
 class _Bake:
     """One bake from start to end; every stage skips what the manifest already holds."""
 
@@ -89,7 +111,7 @@ class _Bake:
         with self.progress.stage("points") as stage:
             samples = self._samples(atlas)
             stage.facts["samples"] = len(samples.position)
-        description = self._description(entries, effects, drawn)
+        description = self._description(entries, effects, drawn, samples)
         fresh = self._claim(description)
         manifest = Manifest(self.folder)
         self._write_places(manifest, atlas, samples)
@@ -100,26 +122,20 @@ class _Bake:
         self._indirect(dataset, manifest, atlas, effects, "test", dataset.split("test"))
         return dataset
 
-    def _description(self, entries: Sequence[tuple[str, Lighting]], effects: Plan, drawn: dict[str, int]) -> dict[str, Any]:
-        config = self.config
+    def _description(
+        self, entries: Sequence[tuple[str, Lighting]], effects: Plan, drawn: dict[str, int], samples: Samples
+    ) -> dict[str, Any]:
         return {
             "schema": store.SCHEMA,
             "ddprt": __version__,
-            "scene": {"name": self.scene.name, "digest": self.scene.digest, "notes": list(self.scene.notes)},
-            "atlas": config.atlas.model_dump(),
+            **baked_settings(self.config, self.scene),
             "quantity": "irradiance",
             "unit": "W/m2",
-            "seed": config.seed,
-            "points": {"count": config.points.count, "on": config.points.on, "file": config.points.file}
-            | {"supersample": config.points.supersample},
-            "transport": config.transport.model_dump(exclude={"threads"}) | {"integrator": self._integrator()},
+            "points": {"count": self.config.points.count, "digest": samples.digest},
             "plan": [asdict(effect) for effect in effects.effects],
             "drawn": drawn,
             "lightings": [{"split": split, "lights": lighting_json(lighting)} for split, lighting in entries],
         }
-
-    def _integrator(self) -> str:
-        return "operator" if self.config.transport.integrator == "auto" else self.config.transport.integrator
 
     def _claim(self, description: dict[str, Any]) -> bool:
         """Writes dataset.json (True), or makes sure that what lies there is this very bake (False)."""
@@ -160,7 +176,7 @@ class _Bake:
         if not manifest.holds("scene.safetensors"):
             write_tensors(self.folder / "scene.safetensors", {"corners": self.scene.corners})
             manifest.add("scene.safetensors")
-        if not all(manifest.holds(f"atlas/{name}.exr") for name in ("position", "coverage")):
+        if not all(manifest.holds(name) for name in store.ATLAS_FILES):
             store.write_atlas(self.folder, atlas, manifest)
 
     def _direct(self, dataset: Dataset, manifest: Manifest, atlas: Atlas, samples: Samples) -> None:
@@ -223,7 +239,7 @@ class _Bake:
         halves = 2 if split == "test" else 1
         with self.progress.stage(f"indirect {split}", halves * atlas.count) as stage:
             before = self.tracer.rays
-            if self._integrator() == "reference":
+            if dataset.description["transport"]["integrator"] == "reference":
                 light, noise = self._by_reference(dataset, atlas, effects, todo, halves, stage)
             else:
                 light, noise = self._by_operator(dataset, atlas, effects, indices, split, halves, stage)

@@ -63,13 +63,13 @@ def doubt(lighting: Lighting, lights_nothing: bool, scene: Scene, tracer: Tracer
     places = [anchor for light in lighting if (anchor := light.anchor()) is not None]
     all_placed = len(places) == len(lighting)
     prefix = "lights nothing: it " if lights_nothing else ""
+    strengths = [value for light in lighting_json(lighting) for key in _STRENGTHS for value in light.get(key, ())]
+    if not any(strengths):
+        return prefix + "has no intensity"
     if all_placed and not (tracer.clearance(np.array(places)) > 0).any():
         return prefix + "stands inside a solid or behind a wall"
     if not lights_nothing:
         return ""
-    strengths = [value for light in lighting_json(lighting) for key in _STRENGTHS for value in light.get(key, ())]
-    if not any(strengths):
-        return prefix + "has no intensity"
     low, high = scene.bounds
     outside = all_placed and all(((place < low) | (place > high)).any() for place in places)
     return prefix + ("stands outside the scene" if outside else "faces away or is shadowed")

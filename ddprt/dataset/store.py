@@ -26,6 +26,7 @@ from ddprt.scene.exr import exposure_for, read_exr, write_exr
 
 SCHEMA = 1
 _GBUFFER = ("position", "normal", "geometric_normal", "albedo", "area", "coverage")
+ATLAS_FILES = tuple(f"atlas/{name}.exr" for name in _GBUFFER)
 
 
 def map_name(kind: str, index: int) -> str:
@@ -163,7 +164,7 @@ def read_description(folder: Path) -> dict[str, Any]:
 
 def expected_files(description: dict[str, Any]) -> list[str]:
     """Names of all files of a finished dataset."""
-    names = ["scene.safetensors", "points.safetensors", *(f"atlas/{name}.exr" for name in _GBUFFER)]
+    names = ["scene.safetensors", "points.safetensors", *ATLAS_FILES]
     for index, entry in enumerate(description["lightings"]):
         kinds = ["direct", "measured", "indirect", *(["noise"] if entry["split"] == "test" else [])]
         names += [map_name(kind, index) for kind in kinds]
@@ -240,6 +241,10 @@ class Manifest:
 
 def write_map(path: Path, image: Float32[np.ndarray, "height width 3"]) -> None:
     """A lightmap as half floats under a power-of-two exposure: value = stored * 2**exposure."""
+    if not np.isfinite(image).all():
+        raise UserError(
+            f"{path.name}: got light past the range of float32; lower the intensities or keep lamps off the surfaces"
+        )
     exposure = exposure_for(float(np.abs(image).max()))
     attributes = {"ddprt_exposure": str(exposure), "ddprt_quantity": "irradiance", "ddprt_unit": "W/m2"}
     write_exr(path, np.ldexp(image, -exposure), half=True, attributes=attributes)

@@ -65,6 +65,10 @@ def export_textures(model: Model, folder: str | Path, *, precision: str = "half"
     has_mean = bool(np.any(relighter.mean))
     if has_mean:
         layers.append(("mean.exr", _image(model, np.asarray(relighter.mean), gutter)))
+    kept = {name for name, _ in layers}
+    for stale in [*folder.glob("basis_*.exr"), *folder.glob("mean.exr")]:
+        if stale.name not in kept:  # of an earlier export with more bases
+            stale.unlink()
     for name, image in layers:
         write_exr(folder / name, image, half=half)
         written.append(folder / name)

@@ -56,6 +56,9 @@ def fit_basis(
       centre: subtract the mean column first.
     Reference: Belcour et al., HPG 2022, Eq. 7 and 8; Turk and Pentland 1991 for the small matrix.
     """
+    if len(columns) == 0 or bases == 0:
+        empty = jnp.zeros((0, columns.shape[1]), jnp.float32)
+        return Basis(empty, jnp.zeros(columns.shape[1]), jnp.zeros((len(columns), 0)), jnp.zeros(len(columns)), 0, "no_signal")
     with jax.enable_x64(True):
         mean, sigma, rotation = _decompose(columns, weights, centre)
         rank = int(np.sum(np.asarray(sigma) > RANK_CUT * float(sigma[0])))

@@ -69,7 +69,7 @@ def load_lightings(path: str | Path) -> list[Lighting]:
         document = json.loads(Path(path).read_text("utf-8"))
     except OSError as error:
         raise UserError(f"{path}: got {error.strerror or error}, expected a readable JSON list of lightings") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise UserError(f"{path}: not JSON: {error}") from None
     if not isinstance(document, list) or not document:
         raise UserError(f"{path}: got {'an empty list' if document == [] else type(document).__name__}, expected lightings")

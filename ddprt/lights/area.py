@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 
 from ddprt import warp
 from ddprt.axes import Float
-from ddprt.lights.light import Colour, Direction, Illumination, LightModel, Vector, brightened, moved, unit
+from ddprt.lights.light import Colour, Extent, Illumination, LightModel, Vector, brightened, moved, unit
 
 
 class RectLight(LightModel):
@@ -20,8 +20,8 @@ class RectLight(LightModel):
     delta: ClassVar[bool] = False
     type: Literal["rect"] = "rect"
     center: Vector
-    half_u: Direction
-    half_v: Direction
+    half_u: Extent
+    half_v: Extent
     radiance: Colour
 
     @model_validator(mode="after")
@@ -67,7 +67,7 @@ class SphereLight(LightModel):
     delta: ClassVar[bool] = False
     type: Literal["sphere"] = "sphere"
     center: Vector
-    radius: Annotated[float, Field(gt=0)]
+    radius: Annotated[float, Field(gt=0, le=1e12)]
     radiance: Colour
 
     def illuminate(self, points: Float[np.ndarray, "n 3"], u: Float[np.ndarray, "n 2"]) -> Illumination:

@@ -12,17 +12,32 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from ddprt.axes import Float
 
-Vector = tuple[float, float, float]
-Colour = tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]]
+_LARGEST = 1e30  # W/sr and the like: its square still has room in the exponent of the sums that follow
+_FARTHEST = 1e12  # metres: its square still fits into float32
+Coordinate = Annotated[float, Field(ge=-_FARTHEST, le=_FARTHEST)]
+Strength = Annotated[float, Field(ge=0, le=_LARGEST)]
+Vector = tuple[Coordinate, Coordinate, Coordinate]
+Colour = tuple[Strength, Strength, Strength]
 
 
-def _not_zero(vector: Vector) -> Vector:
+def _not_zero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
     if not any(vector):
         raise ValueError("got a vector of length 0, expected a direction")
     return vector
 
 
-Direction = Annotated[Vector, AfterValidator(_not_zero)]
+def _normalised(vector: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Unit length, in float64 and safe at any size; a unit vector stays as it is, so that reading back changes nothing."""
+    relative = np.array(_not_zero(vector)) / max(map(abs, vector))
+    length = float(np.linalg.norm(np.array(vector))) if max(map(abs, vector)) < _FARTHEST else np.inf
+    if abs(length - 1) < 1e-12:
+        return vector
+    x, y, z = (relative / np.linalg.norm(relative)).tolist()
+    return (x, y, z)
+
+
+Extent = Annotated[Vector, AfterValidator(_not_zero)]
+Direction = Annotated[tuple[float, float, float], AfterValidator(_normalised)]
 
 
 class LightModel(BaseModel):

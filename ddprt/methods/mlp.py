@@ -70,12 +70,16 @@ class Mlp(Method):
         entries = jnp.asarray(entry_weights(train.area, train.weights, train.channels))  # type: ignore[arg-type]
         basis = fit_basis(rows, entries, bases=self.bases)
         groups = 3 if train.channels == "mono" else 1
+        if basis.rank == 0:
+            inputs = groups + train.frame.values.shape[1] * (3 // groups)
+            dark = ((jnp.zeros((inputs, 0)),), (jnp.zeros(0),), basis.vectors, jnp.zeros(0))
+            return Perceptron(*dark, groups, FitReport(status="no_signal"))
         data = tuple((e.frame.values, e.indirect, e.scale) for e in (train, validation))
         layers, spread, losses = _train(self, groups, *data, basis.vectors, entries, key)
         history = tuple((int(i + 1) * self.check_every, float(a), float(b)) for i, (a, b) in enumerate(np.asarray(losses)))
         finite = all(np.isfinite(row).all() for row in history)
         report = FitReport(
-            status="no_signal" if basis.rank == 0 else basis.status if finite else "diverged",
+            status=basis.status if finite else "diverged",
             bases=len(spread),
             numerical_rank=basis.rank,
             singular_values=tuple(np.asarray(basis.singular_values).tolist()),

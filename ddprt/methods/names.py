@@ -12,4 +12,4 @@ def check_names(config: Config) -> None:
     """
     named = {config.fit.method, *config.methods.compare, *config.methods.settings}
     for name in sorted(named):
-        make_method(name, config.fit.model_dump(exclude={"method"}), config.methods.settings.get(name, {}))
+        make_method(name, config.fit.model_dump(exclude={"method", "points"}), config.methods.settings.get(name, {}))

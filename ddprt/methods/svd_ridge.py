@@ -120,4 +120,4 @@ def _spread(coefficients: Array, train: Examples, bases: int) -> list[np.ndarray
     lit = np.asarray(train.scale[:, :groups]).reshape(-1) > 0
     placed = np.zeros((len(lit), bases))
     placed[lit] = np.asarray(coefficients)
-    return list(placed.reshape(-1, groups, bases).swapaxes(0, 1))
+    return list(placed.reshape(len(train.scale), groups, bases).swapaxes(0, 1))

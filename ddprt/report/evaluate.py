@@ -19,6 +19,8 @@ from ddprt.runtime.model import Model
 from ddprt.runtime.train import fit_method
 from ddprt.scene.mesh import Scene
 
+_STEADY = 0.2  # standard error over brightness below which an estimate counts as near normal
+
 
 @dataclass
 class Evaluation:
@@ -101,6 +103,8 @@ def projection_error(data: Dataset, model: Model, truth: Truth, bases: int | Non
     if basis is None:
         return None
     vectors = np.asarray(basis, np.float64)[:bases]
+    if len(vectors) == 0:
+        return truth.relative_rmse(truth.reference)
     mono = vectors.shape[1] == len(truth.weight)
     measured = data.values(data.split("test"), model.points, model.quantity)
     scale, encoded = _encoded(model.encoding, measured, truth.reference)
@@ -133,13 +137,21 @@ def bases_curve(data: Dataset, config: Config, truth: Truth) -> list[tuple[int, 
 
     One fit serves all: bases are nested, and so are the rows of the transfer matrix under one ridge.
     """
-    test, points = data.split("test"), min(config.points.count, len(data.samples.position))
+    test = data.split("test")
     settings = {**config.methods.settings.get("svd-ridge", {}), "bases": max(config.report.bases_curve)}
     model = fit_method(
-        data, config.fit, "svd-ridge", settings, points=points, quantity=config.points.quantity, seed=config.seed
+        data,
+        config.fit,
+        "svd-ridge",
+        settings,
+        points=config.fit.points or None,
+        quantity=config.points.quantity,
+        seed=config.seed,
     )
-    values, whole = data.values(test, points, config.points.quantity), model.relighter.report.bases
+    values, whole = data.values(test, model.points, model.quantity), model.relighter.report.bases
     has_mean = whole - len(model.relighter.basis)  # type: ignore[attr-defined]
+    if whole == 0:
+        return []
     rows = []
     for bases in sorted({min(bases, whole) for bases in config.report.bases_curve if bases > has_mean}):
         shorter = replace(model, relighter=model.relighter.truncated(bases - has_mean))  # type: ignore[attr-defined]
@@ -153,8 +165,8 @@ def bases_curve(data: Dataset, config: Config, truth: Truth) -> list[tuple[int, 
 def spot_check(scene: Scene, data: Dataset, config: Config) -> dict[str, Any]:
     """Held-out maps against the unbiased reference integrator at random texels.
 
-    The variance of both sides counts: that of the paths, and that of the bake from its two independent halves, pooled over
-    channels and the checked lightings (which share their noise) and over the texels of equal brightness.
+    The variance of both sides counts. Values whose paths are too few to be near normal (a standard error of a fifth of the
+    brightness or more, as on a floor that hardly sees an object) give no z-score, but count in the bias.
 
     Returns:
       z-scores, the relative bias, and the values of both sides, (lightings, texels, 3); empty where it is switched off.
@@ -183,14 +195,16 @@ def spot_check(scene: Scene, data: Dataset, config: Config) -> dict[str, Any]:
         ]
 
     truth = np.stack([estimate.indirect for estimate in paths("light")])
-    # Path sums are skewed: a low mean comes with a low variance, which would shift z. So the variance is a second run's.
-    variance = np.stack([estimate.indirect_variance for estimate in paths("variance")])
+    # Path sums are skewed: a low mean comes with a low variance, which would shift z. So the variance, and the choice of
+    # texels whose estimates are near normal at all, come from a second run.
+    second = paths("variance")
+    brightness, variance = (np.stack([getattr(e, part) for e in second]) for part in ("indirect", "indirect_variance"))
+    steady = np.sqrt(variance) < _STEADY * brightness
     baked = data.maps("indirect", test)[:, texels].astype(np.float64)
-    noise = data.maps("noise", test)[:, texels].astype(np.float64)
-    variance += _pooled_variance(baked, noise)
-    scores = z_scores(baked, truth, variance)
+    variance += _bake_variance(brightness, data.maps("noise", test)[:, texels].astype(np.float64))
+    variance[~steady] = 0
     return {
-        **scores,
+        **z_scores(baked, truth, variance),
         "texels": count,
         "lightings": len(test),
         "baked": baked,
@@ -200,10 +214,13 @@ def spot_check(scene: Scene, data: Dataset, config: Config) -> dict[str, Any]:
     }
 
 
-def _pooled_variance(baked: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Variance of the bake as a share of brightness squared, from half differences; one share per lighting and channel."""
-    share = np.sum(noise**2, 1, keepdims=True) / np.maximum(np.sum(baked**2, 1, keepdims=True), 1e-300)
-    return share * baked**2
+def _bake_variance(brightness: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Variance of the bake from its half differences, proportional to brightness as for counts of rays that see light.
+
+    Pooled over texels and lightings of a channel: a single half difference says little, and all lightings share their rays.
+    """
+    share = np.sum(noise**2, (0, 1)) / np.maximum(np.sum(brightness, (0, 1)), 1e-300)
+    return share * brightness
 
 
 def _frame_by_frame(model: Model, values: np.ndarray) -> tuple[np.ndarray, float]:

@@ -259,7 +259,9 @@ def z_histogram(check: Mapping[str, Any]) -> str:
         known = check["variance"] > 0
         z = (check["baked"] - check["truth"])[known] / np.sqrt(check["variance"][known])
         x = np.linspace(-5, 5, 201)
-        axes.hist(np.clip(z, -4.99, 4.99), np.arange(-5, 5.01, 0.25), density=True, color=SERIES["first"], alpha=0.6)
+        if len(z):
+            bins = np.arange(-5, 5.01, 0.25)
+            axes.hist(np.clip(z, -4.99, 4.99), bins, density=True, color=SERIES["first"], alpha=0.6)
         axes.plot(x, np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi), color=SERIES["second"], label="unit normal")
         axes.set(xlabel="(baked − traced) / standard error", ylabel="density")
         axes.legend(frameon=False)

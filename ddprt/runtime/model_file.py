@@ -78,11 +78,16 @@ def load_model(folder: str | Path) -> Model:
     if schema != SCHEMA:
         raise UserError(f"{folder}: got model schema {schema}, expected {SCHEMA}; fit it again with this version")
     tensors = read_tensors(folder / "tensors.safetensors")
-    relighter_type = METHODS[document["method"]].relighter
     try:
-        return _assemble(document, tensors, relighter_type)
-    except (KeyError, TypeError) as error:
-        raise UserError(f"{folder}: model.json and tensors.safetensors do not fit together ({error}); fit it again") from None
+        relighter_type = METHODS[document["method"]].relighter
+        model = _assemble(document, tensors, relighter_type)
+        model.predict(np.zeros((model.points, 3)))
+    except UserError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        why = " ".join(str(error).split())[:120]
+        raise UserError(f"{folder}: model.json and tensors.safetensors do not fit together ({why}); fit it again") from None
+    return model
 
 
 def _assemble(document: dict[str, Any], tensors: dict[str, np.ndarray], relighter_type: type) -> Model:
@@ -97,7 +102,14 @@ def _assemble(document: dict[str, Any], tensors: dict[str, np.ndarray], relighte
             arguments[entry.name] = static
         else:
             arguments[entry.name] = jnp.asarray(tensors[f"relighter.{entry.name}"])
-    places = document["points"]
+    places, encoding = document["points"], document["encoding"]
+    words = {encoding["space"]: ("linear", "gamma"), encoding["channels"]: ("mono", "multi")}
+    words |= {places["quantity"]: ("radiosity", "irradiance")}
+    for word, known in words.items():
+        if word not in known:
+            raise ValueError(f"got {word!r}, expected {' or '.join(known)}")
+    if not 0 < int(places["count"]) <= len(tensors["points.position"]):
+        raise ValueError(f"got {places['count']} points")
     samples = Samples(tensors["points.position"], tensors["points.normal"], tensors["points.albedo"], places["spacing"])
     return Model(
         document["method"],

@@ -76,7 +76,7 @@ def fit_method(
     seed: int,
 ) -> Model:
     """The same from a [fit] section; `name` overrides its method."""
-    method = make_method(name, config.model_dump(exclude={"method"}), settings)
+    method = make_method(name, config.model_dump(exclude={"method", "points"}), settings)
     points = data.description["points"]["count"] if points is None else points
     if points > len(data.samples.position):
         raise UserError(f"points: got {points}, but the dataset has {len(data.samples.position)} samples; bake with more")
@@ -155,7 +155,7 @@ def fit_config(data: Dataset, config: Config, name: str) -> Model:
         config.fit,
         name,
         config.methods.settings.get(name, {}),
-        points=min(config.points.count, len(data.samples.position)),
+        points=config.fit.points or None,
         quantity=config.points.quantity,
         seed=config.seed,
     )

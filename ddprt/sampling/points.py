@@ -5,6 +5,7 @@ to blue noise. Elimination goes on to a single point; read backwards it is an or
 evenly spread, so that a fit may use fewer points than were baked.
 """
 
+import hashlib
 import heapq
 import json
 from dataclasses import dataclass
@@ -37,6 +38,14 @@ class Samples:
     normal: Float64[np.ndarray, "samples 3"]
     albedo: Float64[np.ndarray, "samples 3"]
     spacing: float
+
+    @property
+    def digest(self) -> str:
+        """Hash of all places: equal digests measure equal light."""
+        state = hashlib.sha256()
+        for array in (self.position, self.normal, self.albedo):
+            state.update(np.ascontiguousarray(array).tobytes())
+        return state.hexdigest()[:16]
 
     def nearest_point(self, points: int) -> Int[np.ndarray, " samples"]:
         """The point (one of the first `points` samples) that each sample is averaged into.
@@ -96,13 +105,15 @@ def load_samples(path: str | Path) -> Samples:
             raise ValueError("expected lists of three numbers")
     except OSError as error:
         raise UserError(f"points.file {path}: got {error.strerror or error}, expected a JSON list of points") from None
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(
             f'points.file {path}: not a JSON list of {{"position", "normal", "albedo"}} with three numbers each ({error})'
         ) from None
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     if not np.isfinite([position, normal, albedo]).all() or not (length > 0).all():
         raise UserError(f"points.file {path}: got a number that is not finite or a normal of length 0; mend the file")
+    if (albedo < 0).any() or (albedo > 1).any():
+        raise UserError(f"points.file {path}: got albedo {albedo.min():g} to {albedo.max():g}, expected 0 to 1; mend the file")
     extent = float(np.ptp(position, axis=0).max()) or 1.0
     return Samples(position, normal / length, albedo, extent / np.sqrt(len(position)))
 

@@ -31,7 +31,12 @@ def load_scene(source: str | Path, **parameters: float | int) -> Scene:
         )
     if suffix not in SUFFIXES:
         raise UserError(f'{path}: got suffix "{path.suffix}", expected {", ".join(SUFFIXES)}; export to glTF')
-    if not path.is_file():
+    try:
+        there = path.is_file()
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise UserError(f"{name[:60]}...: got {why}, expected a path; check it") from None
+    if not there:
         raise UserError(f"{path}: got no such file, expected a mesh; check the path")
     if parameters:
         raise UserError(f"{path.name}: got parameter {next(iter(parameters))}, expected none for a file; leave it out")

@@ -5,6 +5,7 @@ Mitsuba and PBRT do (three.js takes it as sRGB), times the sRGB texture `map_Kd`
 triangle has the mean of its corners. What names no colour, as STL, has albedo 0.8. Files are in metres, Y up.
 """
 
+import io
 import re
 import warnings
 from dataclasses import dataclass
@@ -38,6 +39,8 @@ def load_polygons(path: Path) -> Scene:
             parts = [_part(name, mesh, kind) for name, mesh in _parsed(path, kind).items() if mesh.get("faces") is not None]
             notes = _absent(path, kind)
     except Exception as problem:
+        if isinstance(problem, ModuleNotFoundError):  # trimesh guessing at the encoding of what should have been binary
+            problem = ValueError("neither its binary nor its text form")
         reason = " ".join(f"{type(problem).__name__}: {problem}".split())[:200]
         raise UserError(f"{path.name}: got a damaged file ({reason}), expected {kind.upper()}; export it again") from problem
     if not parts:
@@ -79,9 +82,21 @@ def _parsed(path: Path, kind: str) -> dict[str, Any]:
     from trimesh.resolvers import FilePathResolver
 
     split = {"split_objects": True, "split_groups": True} if kind == "obj" else {}
-    with path.open("rb") as stream:
+    data = path.read_bytes()
+    if kind == "obj":
+        data = _as_utf8(data)
+    with io.BytesIO(data) as stream:
         loaded = mesh_loaders[kind](stream, file_type=kind, resolver=FilePathResolver(str(path)), **split)
     return loaded.get("geometry", {path.stem: loaded})
+
+
+def _as_utf8(data: bytes) -> bytes:
+    """Text in whatever encoding: names and comments in Latin-1 are common, and trimesh wants a further package for them."""
+    try:
+        data.decode("utf-8")
+    except UnicodeDecodeError:
+        return data.decode("latin-1").encode("utf-8")
+    return data
 
 
 def _part(name: str, mesh: dict[str, Any], kind: str) -> _Part:

@@ -28,7 +28,8 @@ def direct_irradiance(
     total = np.zeros_like(positions)
     origins = lifted(tracer, positions, normals)
     for light, numbers in zip(lighting, u, strict=True):
-        sample = light.illuminate(origins, numbers)
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused where light is stored
+            sample = light.illuminate(origins, numbers)
         cosine = np.einsum("nd,nd->n", sample.direction, normals)
         facing = np.flatnonzero((cosine > 0) & sample.irradiance.any(1))
         if len(facing) == 0:
