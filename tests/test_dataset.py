@@ -92,12 +92,13 @@ def test_a_lost_file_is_made_again_with_the_same_bits(lost: str, baked: Path, co
     assert Manifest(folder).damaged() == []
 
 
-def test_a_truncated_manifest_line_does_not_count(baked: Path, cornell: Scene, tmp_path: Path) -> None:
+@pytest.mark.parametrize("rest", [b"", b"x" * 5000])
+def test_a_truncated_manifest_line_does_not_count(rest: bytes, baked: Path, cornell: Scene, tmp_path: Path) -> None:
     folder = tmp_path / "dataset"
     shutil.copytree(baked, folder)
     manifest = folder / "manifest.jsonl"
     lines = manifest.read_bytes().splitlines(keepends=True)
-    manifest.write_bytes(b"".join(lines[:-3]) + lines[-3][:25])
+    manifest.write_bytes(b"".join(lines[:-3]) + lines[-3][:25] + rest)
     assert len(Manifest(folder).entries) == len(lines) - 3
     bake(cornell, config=small(), out=folder)
     named = [json.loads(line)["file"] for line in manifest.read_text().splitlines()]
