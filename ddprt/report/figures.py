@@ -318,7 +318,10 @@ def _plot(name: str, draw: Callable[[Any], None]) -> str:
     """SVG text of one pair of axes, ready to stand in a page: no header, no fixed size, themed, and with its own ids."""
     with _style({"svg.hashsalt": name}):
         figure = _figure(4.6, 3.1, layout=None)  # fixed margins: laying out by measuring would draw everything twice
-        draw(figure.add_axes((0.16, 0.15, 0.82, 0.81)))
+        axes = figure.add_axes((0.16, 0.15, 0.82, 0.81))
+        draw(axes)
+        if axes.get_yscale() == "log" and not axes.dataLim.y1 > 0:  # darkness has no logarithm
+            axes.set_yscale("linear")
         text = _save(figure, "svg", metadata={"Date": None, "Creator": None}).decode()
     text = re.sub(r"^.*?(?=<svg)|<metadata>.*?</metadata>|<style.*?</style>", "", text, flags=re.S)
     text = re.sub(r' (width|height)="[\d.]+pt"', "", text, count=2)
