@@ -19,7 +19,7 @@ import numpy as np
 from ddprt import seeds, warp
 from ddprt.axes import Bool, Float32, Int, Int32
 from ddprt.scene.atlas import Atlas, Senders, SurfaceSampler
-from ddprt.transport.embree import Tracer, lifted
+from ddprt.transport.embree import Hits, Tracer, lifted
 
 _TILE_RAYS = 1 << 16  # rays gathered together by one thread
 _PROBES = 16  # rays that tell an open texel from one inside a solid
@@ -96,9 +96,7 @@ def find_exposed(tracer: Tracer, atlas: Atlas) -> Bool[np.ndarray, " texels"]:
     def work(first: int) -> Bool[np.ndarray, " tile"]:
         last = min(first + _TILE_RAYS // _PROBES, atlas.count)
         u = np.tile(pattern, (last - first, 1))
-        positions, triangle = atlas.sampler.sample(np.repeat(np.arange(first, last), _PROBES), u[:, :2])
-        directions = warp.to_world(warp.sample_cosine(u[:, 2:]), tracer.frames[triangle])
-        hits = tracer.closest(lifted(tracer, positions, tracer.normals[triangle]), directions)
+        hits = _gather(tracer, atlas.sampler, np.repeat(np.arange(first, last), _PROBES), u)
         return (hits.front | (hits.triangle < 0)).reshape(-1, _PROBES).sum(1) * 2 >= _PROBES
 
     return np.concatenate(list(tracer.map(work, range(0, atlas.count, _TILE_RAYS // _PROBES))))
@@ -183,6 +181,16 @@ def _rows(
     return tracer.map(work, range(0, len(shifts), size))
 
 
+def _gather(
+    tracer: Tracer, receivers: SurfaceSampler, receiver: Int[np.ndarray, " rays"], u: Float32[np.ndarray, "rays 4"]
+) -> Hits:
+    """What one cosine-weighted ray per entry meets, from a place anywhere in its receiver."""
+    positions, triangle = receivers.sample(receiver, u[:, :2])
+    frames = np.take(tracer.frames.reshape(-1, 9), triangle, axis=0)
+    directions = warp.to_world(warp.sample_cosine(u[:, 2:]), frames)
+    return tracer.closest(lifted(tracer, positions, frames[:, 6:]), directions)
+
+
 def _senders_seen(
     tracer: Tracer,
     receivers: SurfaceSampler,
@@ -192,10 +200,7 @@ def _senders_seen(
     charts: Float32[np.ndarray, "triangles 6"],
 ) -> Int32[np.ndarray, " rays"]:
     """Sender that one cosine-weighted ray per entry meets from its front, -1 where there is none."""
-    positions, triangle = receivers.sample(receiver, u[:, :2])
-    frames = np.take(tracer.frames.reshape(-1, 9), triangle, axis=0)
-    directions = warp.to_world(warp.sample_cosine(u[:, 2:]), frames)
-    hits = tracer.closest(lifted(tracer, positions, frames[:, 6:]), directions)
+    hits = _gather(tracer, receivers, receiver, u)
     chart = np.take(charts, hits.triangle, axis=0, mode="wrap")
     column, row = (chart[:, k] + hits.u * chart[:, 2 + k] + hits.v * chart[:, 4 + k] for k in (0, 1))
     side = len(to_sender)
