@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parent.parent / "ddprt"
-GROUND = {"errors", "axes", "catalogue", "seeds", "warp", "files", "progress", "machine"}
+GROUND = {"errors", "axes", "catalogue", "compiled", "seeds", "warp", "files", "progress", "machine"}
 WALK = [
     "config",
     "scene",
@@ -75,6 +75,7 @@ def test_each_heavy_library_has_its_door() -> None:
     assert doors("embreex") == {"transport/embree.py"}
     assert doors("OpenEXR") == {"scene/exr.py"}
     assert doors("xatlas") == {"scene/unwrap.py"}
+    assert doors("numba") == {"compiled.py"}
     assert doors("optax") == {"methods/mlp.py"}
     assert {Path(name).parts[0] for name in doors("matplotlib")} == {"report"}
 
@@ -98,7 +99,7 @@ def test_files_hold_one_idea() -> None:
 
 @pytest.mark.parametrize("statement", ["import ddprt", "import ddprt.cli", "from ddprt.config import Config"])
 def test_light_imports_stay_light(statement: str) -> None:
-    heavy = ("jax", "embreex", "matplotlib", "tyro", "rich", "scipy")
+    heavy = ("jax", "embreex", "numba", "matplotlib", "tyro", "rich", "scipy")
     code = f"{statement}\nimport sys; print([m for m in {heavy} if m in sys.modules])"
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert answer.stdout.strip() == "[]"
