@@ -290,4 +290,4 @@ def _help(name: str) -> None:
 
         print("\nsettings (in the file as [section] key = value, here as --section.key value):")
         print("  --methods.settings.NAME '{key = value}'  settings of one method")
-        tyro.cli(Config, args=["--help"], prog=f"ddprt {name} [FILE]", add_help=True)
+        tyro.cli(Config, args=["--help"], prog=f"ddprt {name} [FILE]", add_help=True, config=(tyro.conf.FlagConversionOff,))

@@ -162,8 +162,11 @@ class Run:
         from ddprt.export.textures import export_textures
 
         with self.progress.stage("export"):
-            settings = self.config.export
-            return export_textures(model, self.folder / "export", precision=settings.precision, gutter=settings.gutter)
+            files = export_textures(model, self.folder / "export", **self.config.export.model_dump())
+        seams = json.loads(files[-1].read_text())["seams"]
+        if self.config.export.stitch and not seams["stitched"]:
+            self.progress.say(f"warning: export.stitch: seams stay open: {seams['why']}")
+        return files
 
     def effects(self, data: Dataset) -> Plan:
         """The plan that the dataset was baked under."""

@@ -92,6 +92,11 @@ class Dataset:
         """Triangle corners, metres: what casts shadows."""
         return read_tensors(self.folder / "scene.safetensors")["corners"]
 
+    @cached_property
+    def uv(self) -> Float64[np.ndarray, "triangles 3 2"] | None:
+        """Lightmap coordinates of these corners, origin top-left; None in bakes of older versions."""
+        return read_tensors(self.folder / "scene.safetensors").get("uv")
+
     def maps(self, kind: str, indices: Sequence[int]) -> Float32[np.ndarray, "lightings texels 3"]:
         """Lightmaps of the covered texels in W/m²; kind is "direct", "indirect" or (held-out lightings) "noise"."""
         values = np.empty((len(indices), int(self.covered.sum()), 3), np.float32)

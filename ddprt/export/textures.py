@@ -13,6 +13,7 @@ import numpy as np
 from ddprt import __version__
 from ddprt.errors import UserError
 from ddprt.export.gutter import fill_gutter
+from ddprt.export.seams import Stitcher, find_seams
 from ddprt.files import write_tensors, write_text
 from ddprt.methods.svd_ridge import LinearTransfer
 from ddprt.runtime.model import Model
@@ -31,7 +32,14 @@ DECODE = [
 ]
 
 
-def export_textures(model: Model, folder: str | Path, *, precision: str = "half", gutter: int = 4) -> list[Path]:
+def export_textures(
+    model: Model,
+    folder: str | Path,
+    *,
+    precision: str = "half",
+    gutter: int = 4,
+    stitch: bool = True,
+) -> list[Path]:
     """Writes the export of a linear model.
 
     Args:
@@ -39,6 +47,7 @@ def export_textures(model: Model, folder: str | Path, *, precision: str = "half"
       folder: created if need be.
       precision: "half" or "float" EXR.
       gutter: texels that charts are extended by.
+      stitch: make charts agree where a smooth surface was cut; the manifest says what that did, or why it was not done.
     Returns:
       The files, the manifest last.
     Raises:
@@ -50,9 +59,13 @@ def export_textures(model: Model, folder: str | Path, *, precision: str = "half"
     folder = Path(folder)
     mono = model.encoding.channels == "mono"
     bases = np.asarray(relighter.basis, np.float32)
-    scale = np.abs(bases).max(1, initial=0)
-    scale = np.where(scale > 0, scale, 1).astype(np.float32)
-    images = [_image(model, basis, gutter) for basis in bases / scale[:, None]]
+    has_mean = bool(np.any(relighter.mean))
+    images = [_image(model, entries, gutter) for entries in [*bases, *([np.asarray(relighter.mean)] if has_mean else [])]]
+    images, seams = _stitched(model, images, gutter, stitch)
+    sizes = np.array([np.abs(image).max(initial=0) for image in images[: len(bases)]], np.float32)
+    scale = np.where(sizes > 0, sizes, 1).astype(np.float32)
+    mean = images[len(bases) :]
+    images = [image / size for image, size in zip(images, scale, strict=False)]
     half = precision == "half"
     written, layers = [], []
     if mono:
@@ -62,9 +75,7 @@ def export_textures(model: Model, folder: str | Path, *, precision: str = "half"
             layers.append((f"basis_{first // LAYER:02d}.exr", np.concatenate(group, 2)))
     else:
         layers = [(f"basis_{index:02d}.exr", image) for index, image in enumerate(images)]
-    has_mean = bool(np.any(relighter.mean))
-    if has_mean:
-        layers.append(("mean.exr", _image(model, np.asarray(relighter.mean), gutter)))
+    layers += [("mean.exr", image) for image in mean]
     kept = {name for name, _ in layers}
     for stale in [*folder.glob("basis_*.exr"), *folder.glob("mean.exr")]:
         if stale.name not in kept:  # of an earlier export with more bases
@@ -104,6 +115,7 @@ def export_textures(model: Model, folder: str | Path, *, precision: str = "half"
         "packing": "basis 4 i + c is channel c of layer i" if mono else "layer i is basis i in RGB",
         "mean": "mean.exr" if has_mean else None,
         "basis_scale": scale.tolist(),
+        "seams": seams,
         "matrix": {"file": "transfer.safetensors", "axes": "rgb, bases, points" if mono else "1, bases, points * rgb"},
         "uv": "lightmap coordinates (TEXCOORD_1), origin top-left, row 0 at the top",
         "unit": "irradiance in W/m2, before albedo",
@@ -116,3 +128,27 @@ def export_textures(model: Model, folder: str | Path, *, precision: str = "half"
 def _image(model: Model, entries: np.ndarray, gutter: int) -> np.ndarray:
     """Entries of a basis or mean as an image of 1 (mono) or 3 (multi) channels, charts extended."""
     return fill_gutter(model.image(entries.reshape(int(model.covered.sum()), -1)), model.covered, gutter)
+
+
+def _stitched(model: Model, images: list[np.ndarray], gutter: int, stitch: bool) -> tuple[list[np.ndarray], dict[str, Any]]:
+    """Images with their seams closed, and what the manifest says of that."""
+    if not stitch:
+        return images, {"stitched": False, "why": "export.stitch is false"}
+    if gutter == 0:
+        return images, {"stitched": False, "why": "export.gutter is 0: filtering at a chart's edge reads texels of nothing"}
+    if model.uv is None:
+        return images, {
+            "stitched": False,
+            "why": "a model of an older version, without lightmap coordinates; bake and fit again",
+        }
+    known = fill_gutter(model.covered[..., None].astype(np.float32), model.covered, gutter)[..., 0] > 0
+    stitcher = Stitcher(find_seams(model.occluders, model.uv, known))
+    closed = [stitcher.stitch(image) for image in images]
+    size = [max(float(np.abs(image).max(initial=0)), 1e-30) for image in closed]
+    before, after = (
+        sum(float(stitcher.mismatch(image).mean()) / large for image, large in zip(group, size, strict=True))
+        / max(len(size), 1)
+        for group in (images, closed)
+    )
+    told = {"stitched": True, "edges": stitcher.seams.edges, "texels": len(stitcher.texels)}
+    return closed, {**told, "difference_before": before, "difference_after": after}

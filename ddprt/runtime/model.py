@@ -34,6 +34,7 @@ class Model:
       area: of the covered texels, m².
       occluders: triangle corners that cast shadows, metres.
       scene: name and digest of what it was trained on.
+      uv: lightmap coordinates of the occluders' corners, origin top-left; None in models of older versions.
     """
 
     method: str
@@ -46,6 +47,7 @@ class Model:
     area: np.ndarray
     occluders: np.ndarray
     scene: dict[str, str]
+    uv: np.ndarray | None = None
 
     def predict(self, values: Any, *, clamp: bool = True) -> np.ndarray:
         """Indirect irradiance from measured light.

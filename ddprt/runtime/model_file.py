@@ -34,6 +34,8 @@ def save_model(model: Model, folder: Path) -> None:
         "atlas.area": model.area,
         "scene.corners": model.occluders,
     }
+    if model.uv is not None:
+        tensors["scene.uv"] = model.uv
     static: dict[str, Any] = {}
     for entry in fields(model.relighter):  # type: ignore[arg-type]
         value = getattr(model.relighter, entry.name)
@@ -110,6 +112,9 @@ def _assemble(document: dict[str, Any], tensors: dict[str, np.ndarray], relighte
             raise ValueError(f"got {word!r}, expected {' or '.join(known)}")
     if not 0 < int(places["count"]) <= len(tensors["points.position"]):
         raise ValueError(f"got {places['count']} points")
+    uv = tensors.get("scene.uv")
+    if uv is not None and uv.shape != (len(tensors["scene.corners"]), 3, 2):
+        raise ValueError(f"got lightmap coordinates of shape {uv.shape}")
     samples = Samples(tensors["points.position"], tensors["points.normal"], tensors["points.albedo"], places["spacing"])
     return Model(
         document["method"],
@@ -122,6 +127,7 @@ def _assemble(document: dict[str, Any], tensors: dict[str, np.ndarray], relighte
         tensors["atlas.area"],
         tensors["scene.corners"],
         document["scene"],
+        uv,
     )
 
 

@@ -95,6 +95,7 @@ def fit_method(
         data.area,
         data.occluders,
         {key: data.description["scene"][key] for key in ("name", "digest")},
+        data.uv,
     )
 
 
