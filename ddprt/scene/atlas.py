@@ -1,16 +1,21 @@
 """The lightmap: which texel is where in the world."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
-from ddprt import warp
 from ddprt.axes import Bool, Float, Float32, Float64, Int, Int32
+from ddprt.compiled import compiled
 from ddprt.errors import UserError
 from ddprt.scene.mesh import Scene
-from ddprt.scene.raster import rasterise
+from ddprt.scene.raster import interpolate, rasterise
 from ddprt.scene.unwrap import unwrap
+
+_EQUAL = 1e-9  # pieces whose areas differ by less are taken in their order, so that rounding never chooses
+SHUT = -2
+"""In `Atlas.slot`: a texel that charts cover, but of which nothing is in the open."""
+_BLOCK = 1 << 18  # pieces whose albedo is looked up at once: bounds the memory at about 20 MB
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,33 +46,56 @@ class SurfaceSampler:
     ) -> "SurfaceSampler":
         """Orders pieces by group. Every group from 0 up must have at least one piece with area."""
         order = np.argsort(group, kind="stable")
-        group, area, corners, triangle = group[order], area[order], corners[order], triangle[order]
+        group, area, place, triangle = group[order], area[order], corners.reshape(-1, 9)[order], triangle[order]
         start = np.searchsorted(group, np.arange(group[-1] + 2))
         total = np.add.reduceat(area, start[:-1])
         running = np.cumsum(area)
         before = running[start[:-1]] - area[start[:-1]]
         reach = group + np.clip((running - before[group]) / total[group], 0, 1)
         reach[start[1:] - 1] = group[start[1:] - 1] + 1
-        place = np.concatenate([corners[:, :1], corners[:, 1:] - corners[:, :1]], 1).reshape(-1, 9)
+        place[:, 3:6] -= place[:, :3]
+        place[:, 6:] -= place[:, :3]
         return cls(start, reach, area / total[group], place, triangle)
 
     def sample(
         self, group: Int[np.ndarray, " n"], u: Float32[np.ndarray, "n 2"]
     ) -> tuple[Float32[np.ndarray, "n 3"], Int32[np.ndarray, " n"]]:
-        """Positions (metres) and mesh triangles, one in each given group; groups in rising order are fastest."""
-        first, last = self.start[group.min()], self.start[group.max() + 1]
-        choice = group + u[:, 0].astype(np.float64)
-        piece = first + np.searchsorted(self.reach[first:last], choice, side="right")
-        piece = np.minimum(piece, np.take(self.start, group + 1) - 1)
-        width = np.take(self.width, piece)
-        within = (choice - np.take(self.reach, piece) + width) / np.maximum(width, 1e-300)
-        weights = warp.sample_triangle(np.stack([np.clip(within, 0, 1).astype(np.float32), u[:, 1]], 1))
-        second, third = np.ascontiguousarray(weights.T)
-        place = np.take(self.place, piece, axis=0)
-        positions = np.empty((len(group), 3), np.float32)
-        for axis in range(3):  # a column at a time: three times as fast as broadcasting over rows of three
-            positions[:, axis] = place[:, axis] + second * place[:, 3 + axis] + third * place[:, 6 + axis]
-        return positions, np.take(self.triangle, piece)
+        """Positions (metres) and mesh triangles, one in each given group."""
+        positions, faces = np.empty((len(group), 3), np.float32), np.empty(len(group), np.int32)
+        _place(group, u, self.start, self.reach, self.width, self.place, self.triangle, positions, faces)
+        return positions, faces
+
+
+@compiled
+def _place(
+    group: np.ndarray,
+    u: np.ndarray,
+    start: np.ndarray,
+    reach: np.ndarray,
+    width: np.ndarray,
+    place: np.ndarray,
+    triangle: np.ndarray,
+    positions: np.ndarray,
+    faces: np.ndarray,
+) -> None:
+    """`SurfaceSampler.sample`: the first number chooses a piece and is used again within it; see `warp.sample_triangle`."""
+    one = np.float32(1)
+    for i in range(len(group)):
+        choice = group[i] + np.float64(u[i, 0])
+        low, high = start[group[i]], start[group[i] + 1] - 1
+        while low < high:
+            middle = (low + high) // 2
+            if choice < reach[middle]:
+                high = middle
+            else:
+                low = middle + 1
+        within = np.float32((choice - reach[low] + width[low]) / max(width[low], 1e-300))
+        x, y = min(max(within, np.float32(0)), one), u[i, 1]
+        smaller = np.float32(0.5) * min(x, y)
+        second, third = x - smaller, y - smaller
+        for axis in range(3):
+            positions[i, axis] = place[low, axis] + second * place[low, 3 + axis] + third * place[low, 6 + axis]
+        faces[i] = triangle[low]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,13 +106,24 @@ class Senders:
       of_texel: sender of each covered texel, -1 for texels that take no part.
       area: m².
       albedo: area-weighted mean of the texels' albedo.
+      chart, row, column: where each lies, rows and columns counted in blocks.
+      block: texels along a block's side.
       sampler: points on each sender.
     """
 
     of_texel: Int32[np.ndarray, " texels"]
     area: Float64[np.ndarray, " senders"]
     albedo: Float64[np.ndarray, "senders 3"]
+    chart: Int[np.ndarray, " senders"]
+    row: Int[np.ndarray, " senders"]
+    column: Int[np.ndarray, " senders"]
+    block: int
     sampler: SurfaceSampler
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return len(self.area)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,14 +134,16 @@ class Atlas:
       resolution: texels per side.
       uv: corners of each triangle in the unit square, origin top-left, row 0 at the top.
       texel: row * resolution + column of each covered texel.
-      slot: covered index at each texel, -1 where there is none.
+      slot: covered index at each texel, -1 where there is none, `SHUT` where there was one that is not in the open.
       position: a point of the surface inside the texel, metres, world space.
       normal, geometric_normal: unit vectors there.
       albedo: area-weighted mean, linear.
-      area: m²; sums to the area of the mesh.
+      area: m²; sums to the area of the mesh, or to what of it is in the open (see `transport.openness`).
       coverage: share of the texel's square that is covered.
-      chart: xatlas chart.
+      chart: xatlas chart; where walls stand on one, each region that they bound has its own number.
       centre: of the scene; `sampler` works relative to it, so that float32 suffices.
+      parted: texels that lie on both sides of a wall, and belong to one of them.
+      part: which texel's light lies on each small square of those; -1 for none, where a square touches the wall itself.
     """
 
     resolution: int
@@ -121,6 +162,8 @@ class Atlas:
     piece_area: Float64[np.ndarray, " pieces"] = field(repr=False)
     piece_corners: Float32[np.ndarray, "pieces 3 3"] = field(repr=False)
     piece_triangle: Int32[np.ndarray, " pieces"] = field(repr=False)
+    parted: Int[np.ndarray, " parted"] = field(default_factory=lambda: np.zeros(0, np.int64), repr=False)
+    part: Int32[np.ndarray, "parted down across"] = field(default_factory=lambda: np.zeros((0, 1, 1), np.int32), repr=False)
 
     @property
     def count(self) -> int:
@@ -140,10 +183,10 @@ class Atlas:
     @cached_property
     def lookup(self) -> Int32[np.ndarray, "height width"]:
         """`slot`, with holes next to covered texels closed: a hit on a chart's edge always finds a texel."""
-        padded = np.pad(self.slot, 1, constant_values=-1)  # so that nothing wraps around the image
-        lookup = padded.copy()
+        lookup = np.pad(self.slot, 1, constant_values=-1)  # so that nothing wraps around the image
+        beside = np.maximum(lookup, -1)
         for axis, shift in ((0, 1), (0, -1), (1, 1), (1, -1)):
-            lookup = np.where(lookup < 0, np.roll(padded, shift, axis), lookup)
+            lookup = np.where(lookup == -1, np.roll(beside, shift, axis), lookup)
         return np.ascontiguousarray(lookup[1:-1, 1:-1])
 
     def image(self, values: Float[np.ndarray, "texels ..."], fill: float = 0.0) -> np.ndarray:
@@ -152,13 +195,12 @@ class Atlas:
         image[self.texel] = values
         return image.reshape(self.resolution, self.resolution, *values.shape[1:])
 
-    def senders(self, resolution: int, exposed: Bool[np.ndarray, " texels"]) -> Senders:
-        """Groups the exposed texels (at least one) so that about `resolution` senders lie along a side."""
-        block = max(1, round(self.resolution / resolution))
+    def senders(self, block: int, exposed: Bool[np.ndarray, " texels"]) -> Senders:
+        """Groups the exposed texels (at least one) into squares of `block` texels a side."""
         row, column = np.divmod(self.texel, self.resolution)
         across = -(-self.resolution // block)
         key = (self.chart.astype(np.int64) * across + row // block) * across + column // block
-        _, group = np.unique(key[exposed], return_inverse=True)
+        keys, group = np.unique(key[exposed], return_inverse=True)
         weight = self.area[exposed]
         area = np.bincount(group, weight)
         albedo = np.stack([np.bincount(group, weight * self.albedo[exposed, c]) for c in range(3)], 1) / area[:, None]
@@ -166,7 +208,9 @@ class Atlas:
         of_texel[exposed] = group
         kept = exposed[self.piece_texel]
         pieces = self.piece_texel[kept], self.piece_area[kept], self.piece_corners[kept], self.piece_triangle[kept]
-        return Senders(of_texel, area, albedo, SurfaceSampler.build(of_texel[pieces[0]], *pieces[1:]))
+        sampler = SurfaceSampler.build(of_texel[pieces[0]], *pieces[1:])
+        place = keys // across**2, keys // across % across, keys % across
+        return Senders(of_texel, area, albedo, *place, block, sampler)
 
 
 def build_atlas(scene: Scene, resolution: int = 256, padding: int = 2) -> Atlas:
@@ -183,33 +227,113 @@ def build_atlas(scene: Scene, resolution: int = 256, padding: int = 2) -> Atlas:
     pieces = rasterise(uv * resolution, resolution)
     if len(pieces.texel) == 0:
         raise UserError(f'atlas.resolution: got {resolution}, but "{scene.name}" covers no texel; raise atlas.resolution')
-    texel, of_piece = np.unique(pieces.texel, return_inverse=True)
+    first = np.flatnonzero(np.diff(pieces.texel, prepend=-1))
+    texel, of_piece = pieces.texel[first], np.repeat(np.arange(len(first)), np.diff(first, append=len(pieces.texel)))
     slot = np.full(resolution**2, -1, np.int32)
     slot[texel] = np.arange(len(texel))
     area = pieces.share * scene.areas[pieces.triangle]
-    middle = pieces.barycentric.mean(1)
-
+    large = np.flatnonzero(area > (1 - _EQUAL) * np.maximum.reduceat(area, first)[of_piece])
+    largest = large[np.searchsorted(large, first)]
+    home, weights = pieces.triangle[largest], pieces.barycentric[largest].mean(1, keepdims=True)
+    normal = interpolate(weights, home, scene.normals[scene.triangles])[:, 0]
+    reflected = np.zeros((3, len(texel)))
+    for start in range(0, len(area), _BLOCK):
+        part = slice(start, start + _BLOCK)
+        albedo = scene.albedo_at(pieces.triangle[part], pieces.barycentric[part].mean(1))
+        for channel in range(3):
+            np.add.at(reflected[channel], of_piece[part], area[part] * albedo[:, channel])
     total = np.bincount(of_piece, area)
-    largest = np.lexsort((-area, of_piece))[np.searchsorted(of_piece, np.arange(len(texel)))]
-    home, weights = pieces.triangle[largest], middle[largest]
-    normal = np.einsum("nc,ncd->nd", weights, scene.normals[scene.triangles[home]])
-    albedo = area[:, None] * scene.albedo_at(pieces.triangle, middle)
-    corners = scene.corners - scene.centre
     return Atlas(
         resolution=resolution,
         uv=uv,
         texel=texel,
         slot=slot.reshape(resolution, resolution),
-        position=np.einsum("nc,ncd->nd", weights, scene.corners[home]),
+        position=interpolate(weights, home, scene.corners)[:, 0],
         normal=normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300),
         geometric_normal=scene.geometric_normals[home],
-        albedo=np.stack([np.bincount(of_piece, albedo[:, c]) for c in range(3)], 1) / total[:, None],
+        albedo=(reflected / total).T.copy(),
         area=total,
         coverage=np.bincount(of_piece, pieces.uv_area),
         chart=chart[home],
         centre=scene.centre,
         piece_texel=of_piece,
         piece_area=area,
-        piece_corners=np.einsum("npc,ncd->npd", pieces.barycentric, corners[pieces.triangle]).astype(np.float32),
+        piece_corners=interpolate(pieces.barycentric, pieces.triangle, scene.corners - scene.centre, np.float32),
         piece_triangle=pieces.triangle,
     )
+
+
+def restricted(
+    atlas: Atlas,
+    scene: Scene,
+    changed: Bool[np.ndarray, " texels"],
+    pieces: tuple[
+        Int[np.ndarray, " pieces"],
+        Float64[np.ndarray, " pieces"],
+        Float32[np.ndarray, "pieces 3 3"],
+        Int32[np.ndarray, " pieces"],
+    ],
+) -> Atlas:
+    """The atlas with other pieces: what is left of some texels is measured anew, texels without pieces are dropped.
+
+    Args:
+      atlas: to start from.
+      scene: what it unwraps.
+      changed: texels whose pieces differ; all others keep every bit.
+      pieces: texel (index in `atlas`), area, corners relative to `centre` and mesh triangle of each piece, ordered by texel.
+    """
+    texel, area, corners, triangle = pieces
+    kept = np.bincount(texel, minlength=atlas.count) > 0
+    number = np.where(kept, np.cumsum(kept) - 1, SHUT).astype(np.int32)
+    slot = atlas.slot.copy()
+    slot.ravel()[atlas.texel] = number
+    fresh = np.flatnonzero(changed & kept)
+    mine = np.flatnonzero(changed[texel])
+    first = np.searchsorted(texel[mine], fresh)
+    group = np.repeat(np.arange(len(fresh)), np.diff(first, append=len(mine)))
+    face, size, middle = triangle[mine], area[mine], corners[mine].mean(1, dtype=np.float64)
+    total = np.bincount(group, size, len(fresh))
+    inner = np.stack([np.bincount(group, size * middle[:, axis], len(fresh)) for axis in range(3)], 1) / total[:, None]
+    away = np.linalg.norm(middle - inner[group], axis=1)  # the piece next to the middle of what is left stands for all
+    chosen = np.lexsort((np.arange(len(mine)), away, group))[first]
+    weights = weights_at(scene.corners[face] - scene.centre, middle)
+    home, place = face[chosen], weights[chosen][:, None]
+    normal = interpolate(place, home, scene.normals[scene.triangles])[:, 0]
+    reflected = size[:, None] * scene.albedo_at(face, weights)
+    edges = (atlas.uv[:, 1:] - atlas.uv[:, :1]) * atlas.resolution
+    density = np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]) / (2 * scene.areas)
+    values = {
+        "position": interpolate(place, home, scene.corners)[:, 0],
+        "normal": normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300),
+        "geometric_normal": scene.geometric_normals[home],
+        "albedo": np.stack([np.bincount(group, reflected[:, c], len(fresh)) for c in range(3)], 1) / total[:, None],
+        "area": total,
+        "coverage": np.bincount(group, size * density[face], len(fresh)),
+    }
+    measured = {}
+    for name, found in values.items():
+        column = getattr(atlas, name).copy()
+        column[fresh] = found
+        measured[name] = column[kept]
+    return replace(
+        atlas,
+        texel=atlas.texel[kept],
+        slot=slot,
+        chart=atlas.chart[kept],
+        piece_texel=number[texel].astype(np.int64),
+        piece_area=area,
+        piece_corners=corners,
+        piece_triangle=triangle,
+        **measured,
+    )
+
+
+def weights_at(corners: Float64[np.ndarray, "n 3 3"], point: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+    """Weights of triangles' corners at points on them; points beyond an edge by rounding are moved onto it."""
+    a, b, c = np.moveaxis(corners, 1, 0)
+    normal, offset = np.cross(b - a, c - a), point - a
+    squared = (normal**2).sum(1)
+    second = (np.cross(offset, c - a) * normal).sum(1) / squared
+    third = (np.cross(b - a, offset) * normal).sum(1) / squared
+    weights = np.clip(np.stack([1 - second - third, second, third], 1), 0, None)
+    return weights / weights.sum(1, keepdims=True)

@@ -125,6 +125,40 @@ def convex(*, albedo: float = 0.8, size: float = 1.0) -> Scene:
     return faceted("convex", box(-half, half), (Material("cube", (albedo,) * 3),))
 
 
+def faults(*, albedo: float = 0.7, thickness: float = 0.003, gap: float = 0.004) -> Scene:
+    """Two rooms made to go wrong on a lightmap, and nothing in them lies along its texels.
+
+    A wall thinner than a texel divides a closed room in two and reaches into all its sides, so that light in one half leaves
+    the other exactly dark. In each half a box stands on the floor, one is sunk into it and one hovers a little above it.
+
+    Args:
+      albedo: of everything.
+      thickness: of the dividing wall, metres.
+      gap: below the hovering boxes, metres.
+    Raises:
+      UserError: a wall without thickness.
+    """
+    if thickness <= 0:
+        raise UserError(f"faults.thickness: got {thickness:g} m, expected more than 0; give the wall two sides")
+    x, y, z = np.array([0.0, 2.0]), np.array([0.0, 1.0]), np.array([0.0, 1.2])
+    quads = [hollow(np.ones((1, 1, 1), bool), x, y, z), _turned((1.0, 0.5, 0.6), (thickness, 1.04, 1.36), 7.0)]
+    for side in (0.0, 1.03):
+        quads += [
+            _turned((0.35 + side, 0.1, 0.3), (0.24, 0.2, 0.2), 23.0),
+            _turned((0.62 + side, 0.0, 0.62), (0.22, 0.3, 0.22), 37.0),
+            _turned((0.3 + side, 0.075 + gap, 0.85), (0.25, 0.15, 0.18), 61.0),
+        ]
+    return faceted("faults", np.concatenate(quads), (Material("grey", (albedo,) * 3),))
+
+
+def _turned(centre: tuple[float, float, float], size: tuple[float, float, float], degrees: float) -> np.ndarray:
+    """A closed box seen from outside, turned about the vertical."""
+    half, angle = np.array(size) / 2, math.radians(degrees)
+    cosine, sine = math.cos(angle), math.sin(angle)
+    turn = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
+    return np.round(box(-half, half) @ turn.T + centre, 9)  # sines differ in their last bit from machine to machine
+
+
 SCENES: Catalogue[Callable[..., Scene]] = Catalogue(
     "scene",
     {
@@ -135,6 +169,7 @@ SCENES: Catalogue[Callable[..., Scene]] = Catalogue(
         "corridor": corridor,
         "statue": statue,
         "convex": convex,
+        "faults": faults,
     },
 )
 
