@@ -4,13 +4,17 @@ import json
 from pathlib import Path
 from typing import Any
 
+import mpmath
 import numpy as np
 import pytest
 from oracles import above_horizon, polygon_irradiance
 from pydantic import ValidationError
 
+from ddprt import warp
 from ddprt.errors import UserError
 from ddprt.lights import LIGHTS, Light, lighting_json, load_lightings, parse_lighting
+from ddprt.lights.area import _turned
+from ddprt.lights.light import Illumination
 
 RECORDS: dict[str, dict[str, Any]] = {
     "point": {"type": "point", "position": [0.3, 1.2, -0.4], "intensity": [1.0, 2.0, 0.5]},
@@ -161,6 +165,53 @@ def test_a_sphere_lights_nothing_inside_itself() -> None:
     assert not sample.irradiance.any()
 
 
+# --- slow twins -------------------------------------------------------------------------------------------------------
+
+
+def rectangle_twin(record: dict[str, Any], point: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
+    half_u, half_v = np.array(record["half_u"]), np.array(record["half_v"])
+    away = record["center"] + (2 * u[0] - 1) * half_u + (2 * u[1] - 1) * half_v - point
+    distance = float(np.linalg.norm(away))
+    across = np.cross(half_u, half_v)
+    cosine = max(-away / distance @ across / np.linalg.norm(across), 0)
+    return away / distance, distance, np.array(record["radiance"]) * 4 * np.linalg.norm(across) * cosine / distance**2
+
+
+def sphere_twin(record: dict[str, Any], point: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
+    away, radius = np.array(record["center"]) - point, record["radius"]
+    length = np.linalg.norm(away)
+    cap = 1 - np.sqrt(1 - (radius / length) ** 2)
+    local = warp.sample_cone(u, cap)
+    direction = local @ warp.frame(away / length)
+    along = direction @ away
+    distance = along - np.sqrt(radius**2 - length**2 + along**2)
+    return direction, distance, np.array(record["radiance"]) * 2 * np.pi * cap
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float32, 2e-6), (np.float64, 1e-13)])
+@pytest.mark.parametrize(("kind", "twin"), [("rect", rectangle_twin), ("sphere", sphere_twin)])
+def test_lights_with_size_agree_with_loops(kind: str, twin: Any, dtype: type, tolerance: float) -> None:
+    rng = np.random.default_rng(2)
+    points = rng.uniform(-2, 2, (300, 3)).astype(dtype)
+    points = points[np.linalg.norm(points - RECORDS[kind]["center"], axis=1) > 0.5]
+    u = rng.random((len(points), 2)).astype(dtype)
+    fast = light(RECORDS[kind]).illuminate(points, u)
+    for i, (point, numbers) in enumerate(zip(points.astype(np.float64), u.astype(np.float64), strict=True)):
+        direction, distance, irradiance = twin(RECORDS[kind], point, numbers)
+        np.testing.assert_allclose(fast.direction[i], direction, atol=tolerance)
+        np.testing.assert_allclose(fast.irradiance[i], irradiance, rtol=tolerance, atol=tolerance)
+        # Where a ray grazes the ball the root of a rounding is left: half the digits.
+        np.testing.assert_allclose(fast.distance[i], distance, rtol=tolerance if kind == "rect" else np.sqrt(tolerance))
+
+
+def test_turns_are_good_to_the_last_bit() -> None:
+    u = np.concatenate([np.arange(0, 1, 1 / 64), np.nextafter(np.arange(1, 9) / 8, 0), np.random.default_rng(0).random(1000)])
+    cosine, sine = np.transpose([_turned(turns) for turns in u])
+    # NumPy's cos(2 pi u) would round its argument. Here an eighth of a turn is rounded twice: 1.7e-16, and the results once.
+    np.testing.assert_allclose(cosine, [float(mpmath.cospi(2 * turns)) for turns in u], rtol=0, atol=3e-16)
+    np.testing.assert_allclose(sine, [float(mpmath.sinpi(2 * turns)) for turns in u], rtol=0, atol=3e-16)
+
+
 # --- laws of every light ----------------------------------------------------------------------------------------------
 
 
@@ -201,6 +252,33 @@ def test_points_on_the_light_stay_finite(kind: str, dtype: type) -> None:
         sample = lamp.illuminate(points, np.full((4, 2), u, dtype))
         assert np.isfinite(sample.irradiance).all()
         assert np.isfinite(sample.direction).all()
+
+
+@pytest.mark.parametrize("kind", ["point", "spot", "sphere"])
+def test_a_point_on_the_lamp_receives_nothing_in_float32(kind: str) -> None:
+    lamp = light(RECORDS[kind])
+    assert not lamp.illuminate(lamp.anchor()[None].astype(np.float32), np.full((1, 2), 0.3, np.float32)).irradiance.any()
+
+
+@pytest.mark.parametrize("kind", LIGHTS)
+def test_arrays_may_be_filled_again(kind: str) -> None:
+    rng = np.random.default_rng(0)
+    points, u = rng.uniform(-2, 2, (2, 500, 3)), rng.random((2, 500, 2))
+    fresh = light(RECORDS[kind]).illuminate(points[1], u[1])
+    used = light(RECORDS["spot"]).illuminate(points[0], u[0], Illumination.at(points[0]))
+    again = light(RECORDS[kind]).illuminate(points[1], u[1], used)
+    assert again is used
+    for name in ("direction", "distance", "strength", "colour", "irradiance"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(fresh, name))
+
+
+@pytest.mark.parametrize("kind", LIGHTS)
+def test_too_much_light_is_infinite_without_a_warning(kind: str) -> None:
+    lamp = light(RECORDS[kind]).scaled(1e30)
+    near = lamp.anchor() if kind in ("point", "spot") else np.zeros(3)
+    points = (near + [[0.01, -0.2, 0.02]] * 3).astype(np.float32)
+    with np.errstate(all="raise", under="ignore"):
+        assert (lamp.scaled(1e10).illuminate(points, np.full((3, 2), 0.5, np.float32)).irradiance == np.inf).any()
 
 
 @pytest.mark.parametrize("kind", LIGHTS)

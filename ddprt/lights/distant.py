@@ -17,14 +17,14 @@ class DirectionalLight(LightModel):
     direction: Direction
     irradiance: Colour
 
-    def illuminate(self, points: Float[np.ndarray, "n 3"], u: Float[np.ndarray, "n 2"]) -> Illumination:
+    def illuminate(
+        self, points: Float[np.ndarray, "n 3"], u: Float[np.ndarray, "n 2"], out: Illumination | None = None
+    ) -> Illumination:
         """See `Light`."""
-        towards = -unit(np.asarray(self.direction, points.dtype))
-        return Illumination(
-            np.broadcast_to(towards, points.shape),
-            np.full(len(points), np.inf, points.dtype),
-            np.broadcast_to(np.asarray(self.irradiance, points.dtype), points.shape),
-        )
+        out = out or Illumination.at(points)
+        out.direction.T[:] = -unit(np.array(self.direction))[:, None]
+        out.distance[:], out.strength[:], out.colour[:] = np.inf, 1, self.irradiance
+        return out
 
     def translated(self, offset: Float[np.ndarray, "3"]) -> "DirectionalLight":
         """See `Light`; it has no place to move."""

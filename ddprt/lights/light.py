@@ -10,7 +10,7 @@ from typing import Annotated, ClassVar, Protocol, runtime_checkable
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from ddprt.axes import Float
+from ddprt.axes import Float, Float64
 
 _LARGEST = 1e30  # W/sr and the like: its square still has room in the exponent of the sums that follow
 _FARTHEST = 1e12  # metres: its square still fits into float32
@@ -46,19 +46,33 @@ class LightModel(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Illumination:
-    """One sample of a light for each shaded point.
+    """One sample of a light for each shaded point, in arrays that may be filled again.
 
     Attributes:
-      direction: unit vectors from the point towards the light.
+      direction: unit vectors from the point towards the light, a coordinate after another in memory.
       distance: metres that a shadow ray must cross; infinity for distant lights.
-      irradiance: W/m² on a plane that faces `direction`, already divided by the sampling density.
+      strength: how much of `colour` arrives on a plane that faces `direction`, divided by the sampling density.
+      colour: the light's intensity, irradiance or radiance.
     """
 
     direction: Float[np.ndarray, "n 3"]
     distance: Float[np.ndarray, " n"]
-    irradiance: Float[np.ndarray, "n 3"]
+    strength: Float[np.ndarray, " n"]
+    colour: Float64[np.ndarray, "3"]
+
+    @classmethod
+    def at(cls, points: Float[np.ndarray, "n 3"]) -> "Illumination":
+        """Arrays to be filled, for as many points and of their type."""
+        count, dtype = len(points), points.dtype
+        return cls(np.empty((3, count), dtype).T, np.empty(count, dtype), np.empty(count, dtype), np.zeros(3))
+
+    @property
+    def irradiance(self) -> Float[np.ndarray, "n 3"]:
+        """W/m² on a plane that faces `direction`, divided by the sampling density; infinity where that is too much."""
+        with np.errstate(over="ignore"):
+            return (self.strength[:, None] * self.colour).astype(self.strength.dtype)
 
 
 @runtime_checkable
@@ -73,8 +87,13 @@ class Light(Protocol):
     kind: ClassVar[str]
     delta: ClassVar[bool]
 
-    def illuminate(self, points: Float[np.ndarray, "n 3"], u: Float[np.ndarray, "n 2"]) -> Illumination:
-        """Samples the light from each point: the mean over uniform `u` of irradiance * cosine * visible is E."""
+    def illuminate(
+        self, points: Float[np.ndarray, "n 3"], u: Float[np.ndarray, "n 2"], out: Illumination | None = None
+    ) -> Illumination:
+        """Samples the light from each point: the mean over uniform `u` of irradiance * cosine * visible is E.
+
+        Fills and returns `out` if given: fresh memory for every block of points would cost more than the arithmetic.
+        """
         ...
 
     def translated(self, offset: Float[np.ndarray, "3"]) -> "Light":
@@ -94,6 +113,16 @@ def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     """Normalises; zero vectors stay zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.maximum(length, np.finfo(vectors.dtype).tiny)
+
+
+def columns(vectors: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "k n"]:
+    """A coordinate after another in memory: loops over points then fill the processor's vectors. No copy where it is so."""
+    return np.ascontiguousarray(vectors.T)
+
+
+def place(position: Vector, points: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "3"]:
+    """A lamp's place, rounded as the points are, so that a point on the lamp is known as such; then float64."""
+    return np.array(position, points.dtype).astype(np.float64)
 
 
 def brightened(colour: Colour, factor: float) -> Colour:

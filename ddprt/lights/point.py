@@ -6,7 +6,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from ddprt.axes import Float
-from ddprt.lights.light import Colour, Direction, Illumination, LightModel, Vector, brightened, moved, unit
+from ddprt.compiled import compiled
+from ddprt.lights.light import Colour, Direction, Illumination, LightModel, Vector, brightened, columns, moved, place, unit
 
 
 class PointLight(LightModel):
@@ -18,13 +19,14 @@ class PointLight(LightModel):
     position: Vector
     intensity: Colour
 
-    def illuminate(self, points: Float[np.ndarray, "n 3"], u: Float[np.ndarray, "n 2"]) -> Illumination:
+    def illuminate(
+        self, points: Float[np.ndarray, "n 3"], u: Float[np.ndarray, "n 2"], out: Illumination | None = None
+    ) -> Illumination:
         """See `Light`; a point on the lamp itself receives nothing, since no cosine is defined there."""
-        away = np.asarray(self.position, points.dtype) - points
-        squared = np.einsum("nd,nd->n", away, away)
-        reciprocal = np.divide(1, squared, out=np.zeros_like(squared), where=squared > 0)
-        irradiance = reciprocal[:, None] * np.asarray(self.intensity, points.dtype)
-        return Illumination(unit(away), np.sqrt(squared), irradiance)
+        out = out or Illumination.at(points)
+        out.colour[:] = self.intensity
+        _point(columns(points), place(self.position, points), out.direction.T, out.distance, out.strength)
+        return out
 
     def translated(self, offset: Float[np.ndarray, "3"]) -> "PointLight":
         """See `Light`."""
@@ -57,13 +59,16 @@ class SpotLight(LightModel):
             raise ValueError(f"inner_deg: got {self.inner_deg}, expected less than outer_deg ({self.outer_deg})")
         return self
 
-    def illuminate(self, points: Float[np.ndarray, "n 3"], u: Float[np.ndarray, "n 2"]) -> Illumination:
+    def illuminate(
+        self, points: Float[np.ndarray, "n 3"], u: Float[np.ndarray, "n 2"], out: Illumination | None = None
+    ) -> Illumination:
         """See `Light`."""
-        full = PointLight(position=self.position, intensity=self.intensity).illuminate(points, u)
-        axis = unit(np.asarray(self.direction, points.dtype))
+        out = out or Illumination.at(points)
+        out.colour[:] = self.intensity
+        _point(columns(points), place(self.position, points), out.direction.T, out.distance, out.strength)
         inner, outer = np.cos(np.deg2rad([self.inner_deg, self.outer_deg]))
-        falloff = np.clip((-full.direction @ axis - outer) / max(inner - outer, 1e-6), 0, 1) ** 2
-        return Illumination(full.direction, full.distance, full.irradiance * falloff[:, None].astype(points.dtype))
+        _within_cone(unit(np.array(self.direction)), outer, max(inner - outer, 1e-6), out.direction.T, out.strength)
+        return out
 
     def translated(self, offset: Float[np.ndarray, "3"]) -> "SpotLight":
         """See `Light`."""
@@ -76,3 +81,23 @@ class SpotLight(LightModel):
     def scaled(self, factor: float) -> "SpotLight":
         """See `Light`."""
         return self.model_copy(update={"intensity": brightened(self.intensity, factor)})
+
+
+@compiled
+def _point(points: np.ndarray, position: np.ndarray, direction: np.ndarray, distance: np.ndarray, strength: np.ndarray) -> None:
+    """1 / r², in float64 whatever the arrays hold."""
+    for i in range(points.shape[1]):
+        x, y, z = position[0] - points[0, i], position[1] - points[1, i], position[2] - points[2, i]
+        length = np.sqrt(x * x + y * y + z * z)
+        inverse = 1 / length if length > 0 else 0.0
+        direction[0, i], direction[1, i], direction[2, i] = x * inverse, y * inverse, z * inverse
+        distance[i], strength[i] = length, inverse * inverse
+
+
+@compiled
+def _within_cone(axis: np.ndarray, outer: float, width: float, direction: np.ndarray, strength: np.ndarray) -> None:
+    """Takes away what a spot withholds: `outer` and `width` are the rim's cosine and the way from there to full light's."""
+    for i in range(len(strength)):
+        cosine = -(direction[0, i] * axis[0] + direction[1, i] * axis[1] + direction[2, i] * axis[2])
+        falloff = min(max((cosine - outer) / width, 0.0), 1.0)
+        strength[i] *= falloff * falloff

@@ -91,26 +91,28 @@ class Tracer:
 
     def closest(self, origins: Float32[np.ndarray, "rays 3"], directions: Float32[np.ndarray, "rays 3"]) -> Hits:
         """First surface along each ray (centred frame, unit directions)."""
-        self._count(len(origins))
-        found = self._embree.run(
-            np.ascontiguousarray(origins), np.ascontiguousarray(directions), query="INTERSECT", output=True
-        )
-        triangle = found["primID"]
+        triangle, u, v, distance = self.first(np.ascontiguousarray(origins), np.ascontiguousarray(directions))
         normals = np.take(self.normals, triangle, axis=0, mode="wrap")
         front = np.einsum("nd,nd->n", normals, directions) < 0
-        return Hits(triangle, found["u"], found["v"], front & (triangle >= 0), found["tfar"])
+        return Hits(triangle, u, v, front & (triangle >= 0), distance)
+
+    def first(
+        self, origins: Float32[np.ndarray, "rays 3"], directions: Float32[np.ndarray, "rays 3"]
+    ) -> tuple[np.ndarray, ...]:
+        """Triangle (-1: none), u, v and distance of the first hit of each ray, as Embree gives them; contiguous arrays."""
+        self._count(len(origins))
+        found = self._embree.run(origins, directions, query="INTERSECT", output=True)
+        return found["primID"], found["u"], found["v"], found["tfar"]
 
     def unoccluded(
         self,
         origins: Float32[np.ndarray, "rays 3"],
         directions: Float32[np.ndarray, "rays 3"],
-        distances: Float32[np.ndarray, " rays"],
-    ) -> Bool[np.ndarray, " rays"]:
-        """Whether nothing lies between each origin and its light, `distances` metres away."""
+        reach: Float32[np.ndarray, " rays"],
+    ) -> Int32[np.ndarray, " rays"]:
+        """Not 0 where nothing lies within `reach` metres of an origin; contiguous arrays. Embree overwrites `reach`."""
         self._count(len(origins))
-        reach = np.maximum(distances - self.offset, 0).astype(np.float32)
-        seen = self._embree.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), dists=reach, query="OCCLUDED")
-        return np.asarray(seen) != 0
+        return self._embree.run(origins, directions, dists=reach, query="OCCLUDED")
 
     def _count(self, rays: int) -> None:
         with self._counting:

@@ -5,7 +5,7 @@ import numpy as np
 from ddprt import seeds
 from ddprt.axes import Float32, Float64
 from ddprt.lights import Lighting
-from ddprt.transport.direct import centred, direct_irradiance
+from ddprt.transport.direct import Places, centred, mean_irradiance
 from ddprt.transport.embree import Tracer
 
 AREA_SAMPLES = 64  # shadow rays per sample point towards a light with size
@@ -29,11 +29,8 @@ def measure(
       normals: unit.
       seed, index: address of the random numbers that lights with size need.
     """
-    place, facing = (positions - tracer.centre).astype(np.float32), normals.astype(np.float32)
     lights = centred(tracer, lighting)
-    count = 1 if all(light.delta for light in lights) else AREA_SAMPLES
-    rng = seeds.stream(seed, "measure", index)
-    total = np.zeros(place.shape)
-    for _ in range(count):
-        total += direct_irradiance(tracer, lights, place, facing, rng.random((len(lights), len(place), 2), np.float32))
-    return (total / count).astype(np.float32)
+    samples = 1 if all(light.delta for light in lights) else AREA_SAMPLES
+    place, facing = (positions - tracer.centre).astype(np.float32), normals.astype(np.float32)
+    places = Places.of(tracer, np.repeat(place, samples, 0), np.repeat(facing, samples, 0), samples)
+    return mean_irradiance(tracer, lights, places, seeds.stream(seed, "measure", index))
