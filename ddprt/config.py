@@ -100,14 +100,25 @@ class TransportConfig(Section):
     integrator: Literal["auto", "operator", "reference"] = Field(
         "auto", description="auto takes the cheapest that is valid; reference is unbiased path tracing per lighting"
     )
-    samples: int = Field(512, ge=1, le=65536, description="gather rays per texel for train and validation")
-    test_samples: int = Field(1024, ge=2, le=131072, description="gather rays per texel for held-out lightings, in two halves")
+    samples: Literal["auto"] | Annotated[int, Field(ge=1, le=65536)] = Field(
+        "auto", description="mean gather rays per texel for train and validation; auto: as target_noise asks"
+    )
+    test_samples: Literal["auto"] | Annotated[int, Field(ge=2, le=131072)] = Field(
+        "auto", description="gather rays per texel for held-out lightings, in two halves; auto: as target_noise asks"
+    )
+    target_noise: float = Field(0.01, ge=1e-4, le=1.0, description="relative RMSE of the maps that auto samples aim at")
+    footprint: Unit = Field(
+        0.1,
+        description="train and validation: texels share rays within this share of the harmonic mean distance to what they see; "
+        "0: never",
+    )
+    adaptive: bool = Field(True, description="train and validation: more rays where footprints are small and light varies")
     direct_samples: int = Field(4, ge=1, le=1024, description="shadow rays per texel and light")
     sender_resolution: int = Field(
         0,
         ge=0,
         le=1024,
-        description="texels per side of the coarser atlas that light bounces off; 0: at most 64",
+        description="texels per side of the coarser atlas that light bounces off; 0: at most 128",
     )
     bounces: int = Field(-1, ge=-1, description="-1: as many as the scene calls for; 0, 1, 2...: forced, and reported")
     threads: int = Field(0, ge=0, description="0: one per core")
@@ -153,6 +164,7 @@ class ExportConfig(Section):
 
     precision: Literal["half", "float"] = Field("half", description="of the basis textures")
     gutter: int = Field(4, ge=0, le=64, description="texels that charts are extended by, smoothly")
+    stitch: bool = Field(True, description="make charts agree where a smooth surface was cut to be unwrapped")
 
 
 class Config(Section):

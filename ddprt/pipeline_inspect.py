@@ -1,10 +1,12 @@
 """What would happen, without doing it: the text of `ddprt inspect` and `ddprt doctor`."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ddprt.config import load_config
+from ddprt import seeds
+from ddprt.config import Config, load_config
 from ddprt.errors import UserError
 from ddprt.machine import PACKAGES, installed, machine
 
@@ -59,10 +61,35 @@ def describe(source: str, overrides: dict[str, str]) -> str:
         bound = "" if effect.called else f"; at most {most} of the direct light"
         lines.append(f"effect      {effect.name}: {state}{' (forced)' if effect.forced else ''}: {effect.why}{bound}")
     count = settings.train + settings.validation + settings.test
-    gather = atlas.count * (config.transport.samples + config.transport.test_samples)
     shadow = atlas.count * config.transport.direct_samples * count
-    lines.append(f"a bake      {count} lightings: {gather / 1e6:.0f} M gather rays, {shadow / 1e6:.0f} M shadow rays per lamp")
+    lines.append(f"a bake      {count} lightings: {shadow / 1e6:.0f} M shadow rays per lamp")
+    if lightings and plan(scene, lightings, bounces=config.transport.bounces).bounces:
+        lines += _gathering(config, tracer, atlas, lightings)
     return "\n".join(lines)
+
+
+def _gathering(config: Config, tracer: Any, atlas: Any, lightings: Any) -> list[str]:
+    """What the operator would choose for these lightings."""
+    from ddprt.transport.direct import centred, mean_irradiance, on_texels
+    from ddprt.transport.effort import choose_rays
+    from ddprt.transport.operator import Operator
+
+    operator = Operator.of(tracer, atlas, config.transport.sender_resolution)
+    places = on_texels(tracer, atlas, config.transport.direct_samples, seeds.stream(config.seed, "texel positions"))
+    direct = [
+        mean_irradiance(tracer, centred(tracer, lighting), places, seeds.stream(config.seed, "direct", index))
+        for index, lighting in enumerate(lightings)
+    ]
+    averaged = np.concatenate([operator.averaged(light) for light in direct], 1)
+    lines = []
+    for name, held_out in (("training", False), ("held-out", True)):
+        address: dict[str, Any] = {"seed": config.seed, "stream": f"inspect {name}"}
+        radiosity = operator.bounce(averaged, bounces=config.transport.bounces, **address).radiosity
+        facts = choose_rays(operator, radiosity, config.transport, held_out=held_out, **address).facts
+        rays, noise = facts["samples"], 100 * facts["noise_expected"]
+        total = rays * atlas.count / 1e6
+        lines.append(f"            {name} maps: {rays:g} gather rays per texel ({total:.0f} M), noise about {noise:.2g} %")
+    return lines
 
 
 def checkup() -> tuple[str, bool]:

@@ -22,3 +22,8 @@ def stream(seed: int, name: str, *index: int) -> np.random.Generator:
 def number(seed: int, name: str, *index: int) -> int:
     """A 32-bit seed for libraries that want an integer (Sobol scrambles, JAX keys)."""
     return int(_sequence(seed, name, index).generate_state(1)[0])
+
+
+def digest(values: np.ndarray) -> int:
+    """A checksum of an array, for keys."""
+    return zlib.crc32(np.ascontiguousarray(values).tobytes())

@@ -1,5 +1,6 @@
 """Light against closed forms, slow twins, and itself: direct, reference, operator, plan, and the public yardstick."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from ddprt.scene.shapes import box, faceted, icosphere, rectangle
 from ddprt.transport.effects import EFFECTS, plan, sees_nothing
 from ddprt.transport.embree import Tracer
 from ddprt.transport.measure import measure
-from ddprt.transport.operator import OperatorResult, find_exposed, operator_indirect
+from ddprt.transport.operator import Operator, find_exposed
 from ddprt.transport.reference import Estimate, on_points, on_texels, trace_reference
 
 CENTRE = parse_lighting({"type": "point", "position": [0, 0, 0], "intensity": [1, 1, 1]})
@@ -36,10 +37,33 @@ def reference(scene: Scene, atlas: Atlas, lighting: Lighting, samples: int, **se
     return trace_reference(tracer, scene, lighting, start, atlas.count, samples, **{"seed": 0, **settings})
 
 
-def operator(scene: Scene, atlas: Atlas, direct: np.ndarray, **settings: Any) -> OperatorResult:
-    defaults = {"samples": 128, "sender_resolution": 32, "seed": 0, "stream": "test"}
-    tracer = Tracer.of(scene, settings.pop("threads", 0))
-    return operator_indirect(tracer, atlas, direct.astype(np.float32), **{**defaults, **settings})
+@dataclass
+class Found:
+    indirect: np.ndarray
+    bounces: int
+    remainder: float
+    senders: int
+
+
+def operator(
+    scene: Scene,
+    atlas: Atlas,
+    direct: np.ndarray,
+    samples: int = 128,
+    sender_resolution: int = 32,
+    seed: int = 0,
+    stream: str = "test",
+    bounces: int = -1,
+    threads: int = 0,
+) -> Found:
+    """Plain operator, an even number of rays everywhere."""
+    made = Operator.of(Tracer.of(scene, threads), atlas, sender_resolution=sender_resolution)
+    averaged = np.concatenate([made.averaged(light.astype(np.float32)) for light in direct], 1)
+    bounced = made.bounce(averaged, seed=seed, stream=stream, bounces=bounces)
+    out = np.zeros(direct.shape, np.float32)
+    for _ in made.gather(bounced.radiosity, out, np.full(atlas.count, samples), seed=seed, stream=stream):
+        pass
+    return Found(out, bounced.bounces, bounced.remainder, made.senders.count)
 
 
 def mean(atlas: Atlas, values: np.ndarray, variance: np.ndarray | None = None) -> tuple[float, float]:
@@ -196,7 +220,7 @@ def test_reference_agrees_with_a_path_tracer_of_loops(cornell: Scene) -> None:
 def test_gather_rows_agree_with_brute_force(cornell: Scene) -> None:
     """One-hot direct light brings out G: which share of a texel's hemisphere sees each sender."""
     atlas = build_atlas(cornell, 32)
-    senders = atlas.senders(8, find_exposed(Tracer.of(cornell), atlas))
+    senders = atlas.senders(32 // 8, find_exposed(Tracer.of(cornell), atlas))
     one_hot = (senders.of_texel == np.arange(len(senders.area))[:, None])[..., None] * np.ones(3)
     found = operator(cornell, atlas, one_hot, samples=4096, sender_resolution=8, bounces=1)
     assert found.senders == len(senders.area)
@@ -300,7 +324,7 @@ def test_black_and_convex_scenes_trace_shadow_rays_alone(name: str, monkeypatch:
     decided = plan(scene, [lamp])
     assert decided.bounces == 0
     assert not decided.called("diffuse bounces")
-    monkeypatch.setattr(Tracer, "closest", None)
+    monkeypatch.setattr(Tracer, "first", None)
     tracer = Tracer.of(scene)
     found = trace_reference(
         tracer, scene, lamp, on_texels(tracer, atlas, np.arange(atlas.count)), atlas.count, 4, seed=0, bounces=decided.bounces
@@ -313,7 +337,7 @@ def test_black_and_convex_scenes_trace_shadow_rays_alone(name: str, monkeypatch:
 
 
 def test_a_black_room_is_probed_without_bounce_rays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Tracer, "closest", None)
+    monkeypatch.setattr(Tracer, "first", None)
     direct, indirect = ddprt.irradiance(
         build("furnace", albedo=0, subdivisions=1), CENTRE, [[0, 0.5, 0]], [[0, -1, 0]], samples=2
     )

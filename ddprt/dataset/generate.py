@@ -9,13 +9,14 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from ddprt import __version__, seeds
 from ddprt.config import Config
 from ddprt.dataset import store
+from ddprt.dataset.indirect import IndirectBake
 from ddprt.dataset.splits import SPLITS, Splits, choose_lightings, doubt
 from ddprt.dataset.store import Dataset, Manifest, map_name
 from ddprt.errors import UserError
@@ -25,12 +26,11 @@ from ddprt.progress import Progress
 from ddprt.sampling.points import Samples, load_samples, place_samples
 from ddprt.scene.atlas import Atlas, build_atlas
 from ddprt.scene.mesh import Scene
-from ddprt.transport.direct import centred, direct_irradiance
+from ddprt.transport.direct import centred, mean_irradiance, on_texels
 from ddprt.transport.effects import Plan, plan
 from ddprt.transport.embree import Tracer
 from ddprt.transport.measure import measure
 
-_SENDER_RESOLUTION = 64  # senders along a side where transport.sender_resolution leaves it open
 _NAMED = 8  # doubtful lightings that a warning spells out
 
 
@@ -39,7 +39,7 @@ def bake(
     lightings: Sequence[Lighting] | Splits | None = None,
     *,
     resolution: int = 256,
-    samples: int = 256,
+    samples: int | Literal["auto"] = "auto",
     seed: int = 0,
     config: Config | None = None,
     out: str | Path | None = None,
@@ -52,7 +52,8 @@ def bake(
       lightings: a mapping of "train", "validation" and "test" to lightings; or one list, of which the last fifth becomes test
         and the tenth before it validation; or None to draw them as the configuration says.
       resolution: texels per side of the lightmap.
-      samples: gather rays per texel (twice as many for held-out lightings).
+      samples: gather rays per texel (twice as many for held-out lightings); "auto" as many as `config.transport.target_noise`
+        asks for.
       seed: of all random numbers.
       config: all settings at once; replaces `resolution`, `samples` and `seed`.
       out: folder; an unfinished bake of the same settings there goes on. None bakes into a temporary folder that lives as
@@ -64,7 +65,7 @@ def bake(
       UserError: no lightings, all of them dark, too many points, or a folder that holds another dataset.
     """
     if config is None:
-        transport = {"samples": samples, "test_samples": 2 * samples}
+        transport = {"samples": samples, "test_samples": "auto" if samples == "auto" else 2 * samples}
         config = Config.model_validate({"seed": seed, "atlas": {"resolution": resolution}, "transport": transport})
     keep_alive = tempfile.TemporaryDirectory(prefix="ddprt-") if out is None else None
     folder = Path(keep_alive.name if keep_alive else str(out))
@@ -118,8 +119,9 @@ class _Bake:
         dataset = Dataset(self.folder, description, keep_alive)
         self._direct(dataset, manifest, atlas, samples)
         self._judge_lightings(dataset, fresh)
-        self._indirect(dataset, manifest, atlas, effects, "train", dataset.split("train") + dataset.split("validation"))
-        self._indirect(dataset, manifest, atlas, effects, "test", dataset.split("test"))
+        indirect = IndirectBake(self.config, self.scene, self.tracer, atlas, effects, dataset, manifest, self.progress)
+        indirect.run("train", dataset.split("train") + dataset.split("validation"))
+        indirect.run("test", dataset.split("test"))
         return dataset
 
     def _description(
@@ -174,7 +176,7 @@ class _Bake:
             write_tensors(self.folder / "points.safetensors", {**tensors, "spacing": np.array([samples.spacing])})
             manifest.add("points.safetensors")
         if not manifest.holds("scene.safetensors"):
-            write_tensors(self.folder / "scene.safetensors", {"corners": self.scene.corners})
+            write_tensors(self.folder / "scene.safetensors", {"corners": self.scene.corners, "uv": atlas.uv})
             manifest.add("scene.safetensors")
         if not all(manifest.holds(name) for name in store.ATLAS_FILES):
             store.write_atlas(self.folder, atlas, manifest)
@@ -184,17 +186,14 @@ class _Bake:
         todo = [
             i for i in range(len(dataset.lightings)) if not all(manifest.holds(map_name(k, i)) for k in ("direct", "measured"))
         ]
-        count, seed = self.config.transport.direct_samples, self.config.seed
-        texels = np.repeat(np.arange(atlas.count), count)
-        grid = seeds.stream(seed, "texel positions").random((len(texels), 2), np.float32)
-        strata = (np.tile(np.arange(count, dtype=np.float32), atlas.count) + grid[:, 0]) / count
-        place, triangle = atlas.sampler.sample(texels, np.stack([np.minimum(strata, np.float32(1 - 1e-7)), grid[:, 1]], 1))
-        normals = self.tracer.normals[triangle]
+        if not todo:
+            return
+        seed = self.config.seed
+        places = on_texels(self.tracer, atlas, self.config.transport.direct_samples, seeds.stream(seed, "texel positions"))
 
         def work(index: int) -> int:
             lights = centred(self.tracer, dataset.lightings[index])
-            u = seeds.stream(seed, "direct", index).random((len(lights), len(texels), 2), np.float32)
-            light = direct_irradiance(self.tracer, lights, place, normals, u).reshape(atlas.count, count, 3).mean(1)
+            light = mean_irradiance(self.tracer, lights, places, seeds.stream(seed, "direct", index))
             store.write_map(self.folder / map_name("direct", index), atlas.image(light))
             measured = measure(self.tracer, dataset.lightings[index], samples.position, samples.normal, seed=seed, index=index)
             write_tensors(self.folder / map_name("measured", index), {"irradiance": measured})
@@ -227,91 +226,3 @@ class _Bake:
         if faults:
             more = f"; and {len(faults) - _NAMED} more" if len(faults) > _NAMED else ""
             self.progress.say(f"warning: {len(faults)} doubtful lightings: {'; '.join(faults[:_NAMED])}{more}")
-
-    def _indirect(
-        self, dataset: Dataset, manifest: Manifest, atlas: Atlas, effects: Plan, split: str, indices: list[int]
-    ) -> None:
-        """Indirect lightmaps of a group of lightings that share gather rays: train with validation, or test."""
-        kinds = ["indirect", "noise"] if split == "test" else ["indirect"]
-        todo = manifest.lacks(kinds, indices)
-        if not todo:
-            return
-        halves = 2 if split == "test" else 1
-        with self.progress.stage(f"indirect {split}", halves * atlas.count) as stage:
-            before = self.tracer.rays
-            if dataset.description["transport"]["integrator"] == "reference":
-                light, noise = self._by_reference(dataset, atlas, effects, todo, halves, stage)
-            else:
-                light, noise = self._by_operator(dataset, atlas, effects, indices, split, halves, stage)
-                rows = [indices.index(index) for index in todo]
-                light, noise = light[rows], noise[rows] if halves == 2 else noise
-            for row, index in enumerate(todo):
-                for kind, values in zip(kinds, (light, noise), strict=False):
-                    store.write_map(self.folder / map_name(kind, index), atlas.image(values[row]))
-                    manifest.add(map_name(kind, index))
-            stage.facts["rays"] = self.tracer.rays - before
-
-    def _by_operator(
-        self, dataset: Dataset, atlas: Atlas, effects: Plan, indices: list[int], split: str, halves: int, stage: Any
-    ) -> tuple[np.ndarray, np.ndarray]:
-        direct = dataset.maps("direct", indices)
-        if effects.bounces == 0:
-            return np.zeros_like(direct), np.zeros_like(direct)
-        from ddprt.transport.operator import operator_indirect
-
-        config = self.config.transport
-        samples = config.test_samples if split == "test" else config.samples
-        resolution = config.sender_resolution or min(self.config.atlas.resolution, _SENDER_RESOLUTION)
-        results = [
-            operator_indirect(
-                self.tracer,
-                atlas,
-                direct,
-                samples=max(1, samples // halves),
-                sender_resolution=resolution,
-                seed=self.config.seed,
-                stream=f"{split} {half}",
-                bounces=effects.bounces,
-                advance=stage.advance,
-            )
-            for half in range(halves)
-        ]
-        first = results[0]
-        known = np.isfinite(first.remainder)
-        stage.facts |= {"bounces": first.bounces, "senders": first.senders}
-        stage.facts["remainder"] = f"{first.remainder:.2g}" if known else "unbounded"
-        if effects.bounces < 0 and not first.converged:
-            self.progress.say(
-                f"warning: light was followed for {first.bounces} bounces and has not died away (bound on the rest: "
-                f"{stage.facts['remainder']} of each lighting's peak); lower the largest albedo"
-            )
-        if halves == 1:
-            return first.indirect, np.zeros_like(direct)
-        return (first.indirect + results[1].indirect) / 2, (first.indirect - results[1].indirect) / 2
-
-    def _by_reference(
-        self, dataset: Dataset, atlas: Atlas, effects: Plan, todo: list[int], halves: int, stage: Any
-    ) -> tuple[np.ndarray, np.ndarray]:
-        from ddprt.transport.reference import on_texels, trace_reference
-
-        config = self.config.transport
-        samples = max(1, (config.test_samples if halves == 2 else config.samples) // halves)
-        maps = []
-        for index in todo:
-            parts = [
-                trace_reference(
-                    self.tracer,
-                    self.scene,
-                    dataset.lightings[index],
-                    on_texels(self.tracer, atlas, np.arange(atlas.count)),
-                    atlas.count,
-                    samples,
-                    seed=seeds.number(self.config.seed, "reference bake", index, half),
-                    bounces=effects.bounces,
-                ).indirect
-                for half in range(halves)
-            ]
-            maps.append([sum(parts) / halves, (parts[0] - parts[-1]) / 2])
-            stage.advance(halves * atlas.count // len(todo))
-        light = np.asarray(maps, np.float32)
-        return light[:, 0], light[:, 1]

@@ -1,47 +1,49 @@
-"""Every lighting at once: paths do not know which light is on.
+"""Indirect light of all lightings at once: G, the gather operator, is traced once per scene.
 
-The gather operator G says which share of a receiver's cosine-weighted hemisphere sees which sender. It is traced once,
-and every lighting of the batch is then one column of a matrix product:
+The light that leaves the surfaces lives on *senders*, small blocks of texels, each holding the direct light that it got. What
+bounces on from there is smooth: it is solved for on coarser blocks, as the Neumann series of a dense matrix, and interpolated
+back between their centres within each chart. In the end every receiver adds up the radiosity of the senders that its rays meet:
 
-    senders:    x = E0 + G R x                 solved as a Neumann series (R = diagonal albedo)
-    receivers:  E_indirect = G R x
+    E = G b,    b = R (E0 + P (e_1 + e_2 + ...)),    e_1 = G R E0,    e_k+1 = G P R e_k,    all e_k on the coarse blocks
 
-Senders are the receivers' own texels in blocks (`Atlas.senders`), so their direct light is an area-weighted mean that
-costs no ray. Texels inside a solid (a floor under a block that stands on it) take no part: nothing sees them. The price
-is light averaged inside a sender: a bias that the report's spot check measures against `reference`.
+A lighting is a column of these products, so one more costs its shadow rays and a column. Averaging light over a sender is the
+only bias; `experiments/operator_bias.py` measures it against `reference`.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
-from ddprt import seeds, warp
-from ddprt.axes import Bool, Float32, Int, Int32
-from ddprt.scene.atlas import Atlas, Senders, SurfaceSampler
-from ddprt.transport.embree import Hits, Tracer, lifted
+from ddprt.axes import Bool, Float32, Float64, Int
+from ddprt.compiled import compiled
+from ddprt.scene.atlas import Atlas, Senders
+from ddprt.transport.embree import Tracer
+from ddprt.transport.gather import BACK, Landing, Receivers, seen_from
 
-_TILE_RAYS = 1 << 16  # rays gathered together by one thread
+_SENDER_RESOLUTION = 128  # senders along a side where nothing else is asked for
 _PROBES = 16  # rays that tell an open texel from one inside a solid
+_COARSE = 4096  # most blocks that bounces are solved on: 64 MiB of matrix
+_COARSE_SAMPLES = 256  # rays of each: their noise is averaged once more over all that a texel sees
 _TOLERANCE = 1e-4  # of a lighting's largest indirect value: where the series stops
 _MAX_BOUNCES = 512  # a closed white room never ends; what is left is reported
 
 
 @dataclass(frozen=True)
-class OperatorResult:
-    """Indirect light of all lightings.
+class Bounced:
+    """Light on its way from the senders, all lightings and channels side by side.
 
     Attributes:
-      indirect: irradiance, W/m².
-      bounces: terms of the series that were summed.
+      radiosity: W/m².
+      bounces: bounces that will have been counted once it is gathered.
       remainder: bound on the light of all further bounces, as a share of the lighting's largest indirect value.
-      senders: number of senders.
     """
 
-    indirect: Float32[np.ndarray, "lightings texels 3"]
+    radiosity: Float32[np.ndarray, "senders columns"]
     bounces: int
     remainder: float
-    senders: int
 
     @property
     def converged(self) -> bool:
@@ -49,160 +51,281 @@ class OperatorResult:
         return self.remainder <= _TOLERANCE
 
 
-def operator_indirect(
-    tracer: Tracer,
-    atlas: Atlas,
-    direct: Float32[np.ndarray, "lightings texels 3"],
-    *,
-    samples: int,
-    sender_resolution: int,
-    seed: int,
-    stream: str,
-    bounces: int = -1,
-    advance: Callable[[int], None] = lambda texels: None,
-) -> OperatorResult:
-    """Indirect irradiance at every covered texel for every lighting.
+@dataclass(frozen=True)
+class Pilot:
+    """What a few rays from every texel tell.
 
-    Args:
-      tracer, atlas: the scene.
-      direct: direct irradiance on the atlas, W/m².
-      samples: gather rays per texel and per sender.
-      sender_resolution: senders along a side of the atlas.
-      seed, stream: address of the random numbers; another stream gives independent noise.
-      bounces: -1 sums the series until what is left is negligible; otherwise exactly this many, at least 1.
-      advance: told the number of texels after each finished tile.
+    Attributes:
+      nearness: mean of 1 / distance, 1/m; rays that escape count 0.
+      variance: of a single ray's irradiance, summed over lightings and channels, in units of the largest radiosity squared.
     """
-    exposed = find_exposed(tracer, atlas)
-    if not exposed.any():
-        return OperatorResult(np.zeros_like(direct), 0, 0.0, 0)
-    senders = atlas.senders(sender_resolution, exposed)
-    rng = seeds.stream(seed, "gather", *stream.encode())
-    pattern = warp.sobol(samples, 4, seeds.number(seed, "gather pattern", *stream.encode()))
-    light, summed, remainder = _solve(tracer, atlas, senders, direct, pattern, rng, bounces)
 
-    indirect = np.empty((direct.shape[1], light.shape[1]), np.float32)
-    shifts = rng.random((atlas.count, 4), np.float32)
-    for texels, rows in _rows(tracer, atlas, senders, atlas.sampler, pattern, shifts):
-        indirect[texels] = rows @ light
-        advance(len(rows))
-    shape = (atlas.count, len(direct), 3)
-    return OperatorResult(np.ascontiguousarray(indirect.reshape(shape).swapaxes(0, 1)), summed, remainder, len(senders.area))
+    nearness: Float64[np.ndarray, " texels"]
+    variance: Float64[np.ndarray, " texels"]
+
+
+@dataclass(frozen=True, eq=False)
+class Operator:
+    """G of a scene, for any number of lightings.
+
+    Attributes:
+      tracer, atlas: the scene.
+      senders: what light leaves from.
+      coarse: larger blocks of senders, which further bounces are solved on.
+    """
+
+    tracer: Tracer
+    atlas: Atlas
+    senders: Senders
+    coarse: Senders
+
+    @classmethod
+    def of(cls, tracer: Tracer, atlas: Atlas, sender_resolution: int = 0) -> "Operator":
+        """The operator of a scene, with so many senders along a side of the atlas; 0: at most 128."""
+        exposed = find_exposed(tracer, atlas)
+        block = max(1, round(atlas.resolution / (sender_resolution or min(atlas.resolution, _SENDER_RESOLUTION))))
+        senders = coarse = atlas.senders(block, exposed)
+        while coarse.count > _COARSE:
+            coarse = atlas.senders(2 * coarse.block, exposed)
+        return cls(tracer, atlas, senders, coarse)
+
+    @cached_property
+    def landing(self) -> Landing:
+        """From hits to senders."""
+        return Landing.of(self.atlas, self.senders.of_texel)
+
+    @cached_property
+    def _mean(self) -> Any:
+        """Sparse matrix from texels to senders: the mean by area."""
+        from scipy.sparse import csr_array
+
+        texel = np.flatnonzero(self.senders.of_texel >= 0)
+        sender = self.senders.of_texel[texel]
+        share = (self.atlas.area[texel] / self.senders.area[sender]).astype(np.float32)
+        return csr_array((share, (sender, texel)), shape=(self.senders.count, self.atlas.count))
+
+    def averaged(self, irradiance: Float32[np.ndarray, "texels 3"]) -> Float32[np.ndarray, "senders 3"]:
+        """Mean irradiance of each sender."""
+        return np.asarray(self._mean @ irradiance)
+
+    def bounce(self, direct: Float32[np.ndarray, "senders columns"], *, seed: int, stream: str, bounces: int = -1) -> Bounced:
+        """Follows light between the senders.
+
+        Args:
+          direct: direct irradiance on the senders, W/m², columns (lighting, channel).
+          seed, stream: address of the random numbers; another stream gives independent noise.
+          bounces: -1 goes on until what is left is negligible; otherwise exactly this many, at least 1.
+        """
+        albedo = self.senders.albedo.astype(np.float32)
+        largest = float(albedo.max())
+        repeats = direct.shape[1] // 3
+        radiosity = direct * np.tile(albedo, repeats)
+        if bounces == 1 or largest == 0:
+            peak = direct.max(0, initial=0)
+            return Bounced(radiosity, 1, _remainder(largest, peak, peak))
+        gather, term = self._between_senders(radiosity, seed, stream)
+        reflected = np.tile(self.coarse.albedo.astype(np.float32), repeats)
+        total = term.copy()
+        summed, left = 2, _remainder(largest, term.max(0), total.max(0))
+        while (left > _TOLERANCE if bounces < 0 else summed < bounces) and summed < _MAX_BOUNCES:
+            term = gather @ (reflected * term)
+            total += term
+            summed += 1
+            left = _remainder(largest, term.max(0), total.max(0))
+        radiosity += np.tile(albedo, repeats) * (_between(self.senders, self.coarse) @ total)
+        return Bounced(radiosity, summed, left)
+
+    def _between_senders(
+        self, radiosity: Float32[np.ndarray, "senders columns"], seed: int, stream: str
+    ) -> tuple[Float32[np.ndarray, "coarse coarse"], Float32[np.ndarray, "coarse columns"]]:
+        """G among the coarse blocks, and what they gather from the senders."""
+        coarse = self.coarse
+        place = np.arange(coarse.count), coarse.row, coarse.column
+        receivers = Receivers.of(coarse.sampler, *place, _COARSE_SAMPLES, seed, f"{stream} senders")
+        home = np.zeros(self.senders.count, np.int32)
+        kept = self.senders.of_texel >= 0
+        home[self.senders.of_texel[kept]] = coarse.of_texel[kept]
+        table = _with_dark_row(radiosity)
+
+        def work(tile: slice) -> tuple[np.ndarray, np.ndarray]:
+            count = tile.stop - tile.start
+            rows = np.zeros((count, coarse.count), np.float32)
+            sums = np.zeros((count, table.shape[1]), np.float32)
+            for cells, _ in seen_from(self.tracer, receivers, tile, self.landing):
+                _count_seen(cells, home, rows)
+                _add_seen(cells, table, sums)
+            return rows * np.float32(1 / _COARSE_SAMPLES), sums * np.float32(1 / _COARSE_SAMPLES)
+
+        parts = list(self.tracer.map(work, receivers.tiles()))
+        gather, sums = (np.concatenate(column) for column in zip(*parts, strict=True))
+        return gather, sums
+
+    def gather(
+        self,
+        radiosity: Float32[np.ndarray, "senders columns"],
+        out: Float32[np.ndarray, "lightings texels 3"],
+        rays: Int[np.ndarray, " texels"],
+        *,
+        seed: int,
+        stream: str,
+        skip: int = 0,
+    ) -> Iterator[int]:
+        """Irradiance of texels for every lighting, tile by tile.
+
+        Args:
+          radiosity: from `bounce`.
+          out: written in place; may lie on disk.
+          rays: of each texel; 0 leaves it out.
+          seed, stream: address of the random numbers.
+          skip: tiles that `out` holds already.
+        Yields:
+          The number of texels of each finished tile, in order, the skipped ones included.
+        """
+        table = _with_dark_row(radiosity)
+
+        def work(item: tuple[int, Receivers, slice]) -> int:
+            index, receivers, tile = item
+            if index >= skip:
+                sums = np.zeros((tile.stop - tile.start, table.shape[1]), np.float32)
+                for cells, _ in seen_from(self.tracer, receivers, tile, self.landing):
+                    _add_seen(cells, table, sums)
+                _store(sums, receivers.patch[tile], np.float32(1 / receivers.samples), out)
+            return tile.stop - tile.start
+
+        groups = (
+            Receivers.texels(self.atlas, int(samples), seed, stream, np.flatnonzero(rays == samples))
+            for samples in np.unique(rays[rays > 0])
+        )
+        tiles = ((receivers, tile) for receivers in groups for tile in receivers.tiles())
+        yield from self.tracer.map(work, ((index, *tile) for index, tile in enumerate(tiles)))
+
+    def gather_some(
+        self,
+        radiosity: Float32[np.ndarray, "senders columns"],
+        texels: Int[np.ndarray, " chosen"],
+        samples: int,
+        *,
+        seed: int,
+        stream: str,
+    ) -> Float32[np.ndarray, "lightings chosen 3"]:
+        """Irradiance of a few texels in rising order, with as many rays from each."""
+        rays = np.zeros(self.atlas.count, np.int64)
+        rays[texels] = samples
+        out = np.zeros((radiosity.shape[1] // 3, self.atlas.count, 3), np.float32)
+        for _ in self.gather(radiosity, out, rays, seed=seed, stream=stream):
+            pass
+        return out[:, texels]
+
+    def pilot(self, radiosity: Float32[np.ndarray, "senders columns"], samples: int, *, seed: int, stream: str) -> Pilot:
+        """A first look from every texel, with random numbers of its own."""
+        receivers = Receivers.texels(self.atlas, samples, seed, f"{stream} pilot")
+        relative = radiosity / max(float(radiosity.max()), np.finfo(np.float32).tiny)  # its square stays in range
+        table = _with_dark_row(np.concatenate([relative, (relative**2).sum(1, keepdims=True)], 1))
+
+        def work(tile: slice) -> tuple[np.ndarray, np.ndarray]:
+            sums = np.zeros((tile.stop - tile.start, table.shape[1]), np.float32)
+            near = np.zeros(tile.stop - tile.start)
+            for cells, distance in seen_from(self.tracer, receivers, tile, self.landing):
+                _add_seen(cells, table, sums)
+                _add_nearness(cells, distance, near)
+            mean = sums.astype(np.float64) / samples
+            return near / samples, np.maximum(mean[:, -1] - (mean[:, :-1] ** 2).sum(1), 0)
+
+        parts = list(self.tracer.map(work, receivers.tiles()))
+        return Pilot(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def find_exposed(tracer: Tracer, atlas: Atlas) -> Bool[np.ndarray, " texels"]:
     """Texels in the open: at least half of what they see along 16 rays are fronts, or nothing."""
-    pattern = warp.sobol(_PROBES, 4, seed=1)
+    receivers = Receivers.texels(atlas, _PROBES, 0, "exposed")
+    landing = Landing.of(atlas, np.zeros(atlas.count, np.int32))
 
-    def work(first: int) -> Bool[np.ndarray, " tile"]:
-        last = min(first + _TILE_RAYS // _PROBES, atlas.count)
-        u = np.tile(pattern, (last - first, 1))
-        hits = _gather(tracer, atlas.sampler, np.repeat(np.arange(first, last), _PROBES), u)
-        return (hits.front | (hits.triangle < 0)).reshape(-1, _PROBES).sum(1) * 2 >= _PROBES
+    def work(tile: slice) -> Bool[np.ndarray, " tile"]:
+        backs = sum((cells == BACK).sum(0) for cells, _ in seen_from(tracer, receivers, tile, landing))
+        return 2 * backs <= _PROBES
 
-    return np.concatenate(list(tracer.map(work, range(0, atlas.count, _TILE_RAYS // _PROBES))))
-
-
-def _solve(
-    tracer: Tracer,
-    atlas: Atlas,
-    senders: Senders,
-    direct: Float32[np.ndarray, "lightings texels 3"],
-    pattern: Float32[np.ndarray, "samples 4"],
-    rng: np.random.Generator,
-    bounces: int,
-) -> tuple[Float32[np.ndarray, "senders columns"], int, float]:
-    """Radiosity R (E0 + G R E0 + ...) of every sender, the bounces it holds, and the share left out."""
-    count, lightings = len(senders.area), len(direct)
-    term = _mean_over_senders(senders, atlas, direct)
-    albedo = np.tile(senders.albedo.astype(np.float32), (1, lightings))
-    total = term.copy()
-    largest = float(senders.albedo.max())
-    if bounces == 1 or largest == 0:
-        return albedo * total, 1, _remainder(largest, term, total)
-    gather = np.empty((count, count), np.float32)
-    for tile, rows in _rows(tracer, atlas, senders, senders.sampler, pattern, rng.random((count, 4), np.float32)):
-        gather[tile] = rows
-    summed, left = 1, np.inf
-    while (left > _TOLERANCE if bounces < 0 else summed < bounces) and summed < _MAX_BOUNCES:
-        term = gather @ (albedo * term)
-        total += term
-        summed += 1
-        left = _remainder(largest, term, total)
-    return albedo * total, summed, left
+    return np.concatenate(list(tracer.map(work, receivers.tiles())))
 
 
-def _remainder(largest: float, term: np.ndarray, total: np.ndarray) -> float:
+def _remainder(largest: float, last: np.ndarray, total: np.ndarray) -> float:
     """Bound on the light of all further terms: rows of G sum to at most 1, so each is at most `largest` times the last."""
-    peak = total.max(0)
-    ratio = np.divide(term.max(0), peak, out=np.zeros_like(peak), where=peak > 0).max(initial=0)
+    ratio = np.divide(last, total, out=np.zeros_like(total), where=total > 0).max(initial=0)
     return float(ratio * largest / (1 - largest)) if largest < 1 else float("inf" if ratio > 0 else 0)
 
 
-def _mean_over_senders(
-    senders: Senders, atlas: Atlas, direct: Float32[np.ndarray, "lightings texels 3"]
-) -> Float32[np.ndarray, "senders columns"]:
-    from scipy.sparse import csr_array
+def _between(senders: Senders, coarse: Senders) -> Any:
+    """Sparse matrix that interpolates between the centres of coarse blocks, within each chart; rows sum to 1."""
+    from scipy.sparse import csr_array, eye_array
 
-    texel = np.flatnonzero(senders.of_texel >= 0)
-    sender = senders.of_texel[texel]
-    share = (atlas.area[texel] / senders.area[sender]).astype(np.float32)
-    mean = csr_array((share, (sender, texel)), shape=(len(senders.area), atlas.count))
-    return mean @ np.ascontiguousarray(direct.swapaxes(0, 1)).reshape(atlas.count, -1)
-
-
-def _rows(
-    tracer: Tracer,
-    atlas: Atlas,
-    senders: Senders,
-    receivers: SurfaceSampler,
-    pattern: Float32[np.ndarray, "samples 4"],
-    shifts: Float32[np.ndarray, "receivers 4"],
-) -> Iterator[tuple[slice, Float32[np.ndarray, "tile senders"]]]:
-    """Tiles of G in order: (receiver slice, shares of the hemisphere that see each sender)."""
-    samples, count = len(pattern), len(senders.area)
-    size = max(1, _TILE_RAYS // samples)
-    to_sender = np.where(atlas.lookup >= 0, senders.of_texel[atlas.lookup], -1).astype(np.int32)
-    edges = atlas.uv[:, 1:] - atlas.uv[:, :1]
-    charts = np.concatenate([atlas.uv[:, :1], edges], 1).reshape(-1, 6) * atlas.resolution
-    charts = charts.astype(np.float32)
-
-    def work(first: int) -> tuple[slice, Float32[np.ndarray, "tile senders"]]:
-        last = min(first + size, len(shifts))
-        rows = np.zeros((last - first) * count, np.int64)
-        for start in range(0, samples, _TILE_RAYS):
-            u = pattern[None, start : start + _TILE_RAYS] + shifts[first:last, None]
-            u -= np.floor(u)
-            receiver = np.repeat(np.arange(last - first), u.shape[1])
-            seen = _senders_seen(tracer, receivers, first + receiver, u.reshape(-1, 4), to_sender, charts)
-            flat = (receiver * count + seen)[seen >= 0]
-            rows += np.bincount(flat, minlength=len(rows))
-        return slice(first, last), (rows.reshape(-1, count) * np.float32(1 / samples)).astype(np.float32)
-
-    return tracer.map(work, range(0, len(shifts), size))
+    if coarse.block == senders.block:
+        return eye_array(senders.count, dtype=np.float32, format="csr")
+    across = int(max(coarse.row.max(), coarse.column.max())) + 3
+    keys = (coarse.chart.astype(np.int64) * across + coarse.row + 1) * across + coarse.column + 1  # sorted, as senders are
+    at = [(place + 0.5) * (senders.block / coarse.block) - 0.5 for place in (senders.row, senders.column)]
+    low = [np.floor(place).astype(np.int64) for place in at]
+    entries: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    for down in (0, 1):
+        for right in (0, 1):
+            weight = np.abs(1 - down - (at[0] - low[0])) * np.abs(1 - right - (at[1] - low[1]))
+            key = (senders.chart.astype(np.int64) * across + low[0] + down + 1) * across + low[1] + right + 1
+            found = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
+            there = np.flatnonzero((keys[found] == key) & (weight > 0))
+            entries.append((weight[there], there, found[there]))
+    weight, sender, block = (np.concatenate(column) for column in zip(*entries, strict=True))
+    weight /= np.bincount(sender, weight, senders.count)[sender]
+    return csr_array((weight.astype(np.float32), (sender, block)), shape=(senders.count, coarse.count))
 
 
-def _gather(
-    tracer: Tracer, receivers: SurfaceSampler, receiver: Int[np.ndarray, " rays"], u: Float32[np.ndarray, "rays 4"]
-) -> Hits:
-    """What one cosine-weighted ray per entry meets, from a place anywhere in its receiver."""
-    positions, triangle = receivers.sample(receiver, u[:, :2])
-    frames = np.take(tracer.frames.reshape(-1, 9), triangle, axis=0)
-    directions = warp.to_world(warp.sample_cosine(u[:, 2:]), frames)
-    return tracer.closest(lifted(tracer, positions, frames[:, 6:]), directions)
+def _with_dark_row(radiosity: Float32[np.ndarray, "senders columns"]) -> Float32[np.ndarray, "senders_and_dark columns"]:
+    return np.concatenate([radiosity, np.zeros_like(radiosity[:1])])
 
 
-def _senders_seen(
-    tracer: Tracer,
-    receivers: SurfaceSampler,
-    receiver: Int[np.ndarray, " rays"],
-    u: Float32[np.ndarray, "rays 4"],
-    to_sender: Int32[np.ndarray, "height width"],
-    charts: Float32[np.ndarray, "triangles 6"],
-) -> Int32[np.ndarray, " rays"]:
-    """Sender that one cosine-weighted ray per entry meets from its front, -1 where there is none."""
-    hits = _gather(tracer, receivers, receiver, u)
-    chart = np.take(charts, hits.triangle, axis=0, mode="wrap")
-    column, row = (chart[:, k] + hits.u * chart[:, 2 + k] + hits.v * chart[:, 4 + k] for k in (0, 1))
-    side = len(to_sender)
-    texel = np.clip(row.astype(np.int32), 0, side - 1) * side + np.clip(column.astype(np.int32), 0, side - 1)
-    return np.where(hits.front, np.take(to_sender, texel), -1)
+@compiled
+def _count_seen(cells: np.ndarray, home: np.ndarray, rows: np.ndarray) -> None:
+    """Adds one to each receiver's row wherever one of its rays lands."""
+    for sample in range(cells.shape[0]):
+        for receiver in range(cells.shape[1]):
+            cell = cells[sample, receiver]
+            if cell >= 0:
+                rows[receiver, home[cell]] += np.float32(1)
+
+
+@compiled
+def _add_seen(cells: np.ndarray, table: np.ndarray, sums: np.ndarray) -> None:
+    """Adds to each receiver's row the table's rows that its rays land on; the last row of the table is dark.
+
+    Neighbours' rays of one sample land close together: their rows are still in the cache. Four at a time save traffic.
+    """
+    samples, tile = cells.shape
+    dark = len(table) - 1
+    for sample in range(0, samples, 4):
+        for receiver in range(tile):
+            a, b, c, d = dark, dark, dark, dark
+            if cells[sample, receiver] >= 0:
+                a = cells[sample, receiver]
+            if sample + 1 < samples and cells[sample + 1, receiver] >= 0:
+                b = cells[sample + 1, receiver]
+            if sample + 2 < samples and cells[sample + 2, receiver] >= 0:
+                c = cells[sample + 2, receiver]
+            if sample + 3 < samples and cells[sample + 3, receiver] >= 0:
+                d = cells[sample + 3, receiver]
+            for k in range(table.shape[1]):
+                sums[receiver, k] += (table[a, k] + table[b, k]) + (table[c, k] + table[d, k])
+
+
+@compiled
+def _store(sums: np.ndarray, texels: np.ndarray, scale: np.floating, out: np.ndarray) -> None:
+    """Turns rows of texels into columns of maps."""
+    for lighting in range(out.shape[0]):
+        for receiver in range(len(texels)):
+            for channel in range(3):
+                out[lighting, texels[receiver], channel] = scale * sums[receiver, 3 * lighting + channel]
+
+
+@compiled
+def _add_nearness(cells: np.ndarray, distance: np.ndarray, near: np.ndarray) -> None:
+    """Sums 1 / distance of all rays that meet a surface."""
+    for sample in range(cells.shape[0]):
+        for receiver in range(cells.shape[1]):
+            if distance[sample, receiver] < np.inf:
+                near[receiver] += 1 / max(distance[sample, receiver], np.float32(1e-30))

@@ -1,0 +1,152 @@
+"""Indirect lightmaps of a dataset: by the operator for all lightings at once, or lighting by lighting by the reference."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ddprt import seeds
+from ddprt.axes import Float32
+from ddprt.config import Config
+from ddprt.dataset.scratch import Scratch
+from ddprt.dataset.store import Dataset, Manifest, map_name, read_map, write_map
+from ddprt.progress import Progress, Stage
+from ddprt.scene.atlas import Atlas
+from ddprt.scene.mesh import Scene
+from ddprt.transport.effects import Plan
+from ddprt.transport.embree import Tracer
+
+
+@dataclass(frozen=True, eq=False)
+class IndirectBake:
+    """What all indirect maps of a dataset have in common.
+
+    Held-out maps are the mean of two independent halves, texel by texel, and their half difference is kept as `noise`. Training
+    maps may share rays between neighbouring texels and spread them unevenly: cheaper, with a bias that is never let into what
+    scores are computed on.
+    """
+
+    config: Config
+    scene: Scene
+    tracer: Tracer
+    atlas: Atlas
+    effects: Plan
+    dataset: Dataset
+    manifest: Manifest
+    progress: Progress
+
+    def run(self, split: str, indices: list[int]) -> None:
+        """Bakes the maps of lightings that share their gather rays: "train" (with validation), or "test"."""
+        kinds = ["indirect", "noise"] if split == "test" else ["indirect"]
+        todo = self.manifest.lacks(kinds, indices)
+        if not todo:
+            return
+        with self.progress.stage(f"indirect {split}", len(kinds) * self.atlas.count) as stage:
+            before = self.tracer.rays
+            if self.effects.bounces == 0:
+                dark = np.zeros((self.atlas.count, 3), np.float32)
+                self._write(todo, lambda index: [dark] * len(kinds), kinds)
+            elif self.dataset.description["transport"]["integrator"] == "reference":
+                self._by_reference(split, todo, kinds, stage)
+            else:
+                self._by_operator(split, indices, todo, kinds, stage)
+            stage.facts["rays"] = self.tracer.rays - before
+
+    def _by_operator(self, split: str, indices: list[int], todo: list[int], kinds: list[str], stage: Stage) -> None:
+        from ddprt.transport.effort import choose_rays
+        from ddprt.transport.operator import Operator
+
+        config, test = self.config.transport, split == "test"
+        operator = Operator.of(self.tracer, self.atlas, config.sender_resolution)
+        direct = self._averaged(operator, indices)
+        parts, rays, footprints = [], None, None
+        for half in range(len(kinds)):
+            stream = f"{split} {half}"
+            bounced = operator.bounce(direct, seed=self.config.seed, stream=stream, bounces=self.effects.bounces)
+            if rays is None:
+                chosen = choose_rays(operator, bounced.radiosity, config, held_out=test, seed=self.config.seed, stream=stream)
+                rays, footprints = chosen.rays, chosen.footprints
+                stage.facts |= chosen.facts | self._facts(bounced, operator)
+            scratch = Scratch(
+                self.dataset.folder / f"{split}-{half}.part",
+                (len(indices), self.atlas.count, 3),
+                {"dataset": self.dataset.description, "rays": seeds.digest(rays), "half": half},
+            )
+            tiles = operator.gather(
+                bounced.radiosity, scratch.maps, rays, seed=self.config.seed, stream=stream, skip=scratch.done
+            )
+            for texels in tiles:
+                scratch.advance()
+                stage.advance(texels)
+            scratch.note()
+            parts.append(scratch)
+
+        def finished(index: int) -> list[np.ndarray]:
+            row = indices.index(index)
+            if test:
+                first, second = (part.maps[row] for part in parts)
+                return [(first + second) / 2, (first - second) / 2]
+            return [footprints.pooled(parts[0].maps[row]) if footprints else parts[0].maps[row]]
+
+        self._write(todo, finished, kinds)
+        for part in parts:
+            part.remove()
+
+    def _facts(self, bounced: Any, operator: Any) -> dict[str, Any]:
+        """What the series left out; said aloud where that matters."""
+        remainder = f"{bounced.remainder:.2g}" if np.isfinite(bounced.remainder) else "unbounded"
+        if self.effects.bounces < 0 and not bounced.converged:
+            self.progress.say(
+                f"warning: light was followed for {bounced.bounces} bounces and has not died away (bound on the rest: "
+                f"{remainder} of each lighting's peak); lower the largest albedo"
+            )
+        return {"bounces": bounced.bounces, "senders": operator.senders.count, "remainder": remainder}
+
+    def _averaged(self, operator: Any, indices: Sequence[int]) -> Float32[np.ndarray, "senders columns"]:
+        """Direct light of all lightings on the senders, a map at a time."""
+        covered = self.dataset.covered
+
+        def work(index: int) -> np.ndarray:
+            return operator.averaged(read_map(self.dataset.folder / map_name("direct", index))[covered])
+
+        return np.concatenate(list(self.tracer.map(work, indices)), 1)
+
+    def _by_reference(self, split: str, todo: list[int], kinds: list[str], stage: Stage) -> None:
+        from ddprt.transport.reference import on_texels, trace_reference
+
+        config, halves, atlas = self.config.transport, len(kinds), self.atlas
+        given = config.test_samples if split == "test" else config.samples
+        samples = _REFERENCE_SAMPLES if given == "auto" else max(1, given // halves)
+        for index in todo:
+            parts = []
+            for half in range(halves):
+                estimate = trace_reference(
+                    self.tracer,
+                    self.scene,
+                    self.dataset.lightings[index],
+                    on_texels(self.tracer, atlas, np.arange(atlas.count)),
+                    atlas.count,
+                    samples,
+                    seed=seeds.number(self.config.seed, "reference bake", index, half),
+                    bounces=self.effects.bounces,
+                )
+                parts.append(estimate.indirect)
+            maps = [sum(parts) / halves, (parts[0] - parts[-1]) / 2]
+            self._write([index], lambda _, maps=maps: [values.astype(np.float32) for values in maps], kinds)
+            stage.advance(halves * atlas.count // len(todo))
+
+    def _write(self, indices: Sequence[int], maps: Any, kinds: list[str]) -> None:
+        """Writes the maps of lightings side by side, and names them in order."""
+
+        def work(index: int) -> int:
+            for kind, values in zip(kinds, maps(index), strict=False):
+                write_map(self.dataset.folder / map_name(kind, index), self.atlas.image(values))
+            return index
+
+        for index in self.tracer.map(work, indices):
+            for kind in kinds:
+                self.manifest.add(map_name(kind, index))
+
+
+_REFERENCE_SAMPLES = 512
