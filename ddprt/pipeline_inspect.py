@@ -20,10 +20,10 @@ def describe(source: str, overrides: dict[str, str]) -> str:
     """
     from ddprt.lights import Lighting
     from ddprt.sampling.lightings import draw_lightings
-    from ddprt.scene.atlas import build_atlas
     from ddprt.scene.files import load_scene
     from ddprt.transport.effects import plan
     from ddprt.transport.embree import Tracer
+    from ddprt.transport.openness import build_open_atlas
 
     configured = Path(source).suffix == ".toml"
     config = load_config(
@@ -38,13 +38,15 @@ def describe(source: str, overrides: dict[str, str]) -> str:
         *(f"material    {m.name}: albedo {np.round(m.albedo, 4).tolist()}{', textured' if m.texture is not None else ''}"
           for m in scene.materials),
     ]  # fmt: skip
-    atlas = build_atlas(scene, config.atlas.resolution, config.atlas.padding)
+    tracer = Tracer.of(scene)
+    atlas, hidden = build_open_atlas(tracer, scene, config.atlas.resolution, config.atlas.padding)
     charts = len(np.unique(atlas.chart))
     lines.append(
         f"atlas       {atlas.resolution} x {atlas.resolution}: {atlas.count} texels covered "
         f"({100 * atlas.count / atlas.resolution**2:.0f} %), {charts} charts, {atlas.texels_per_metre:.4g} texels per metre"
     )
-    tracer = Tracer.of(scene)
+    if any(hidden.values()):
+        lines.append("            " + ", ".join(f"{count} {what}" for what, count in hidden.items()) + " by other geometry")
     settings = config.lightings
     lightings: tuple[Lighting, ...] = ()
     drawn = min(8, settings.train)

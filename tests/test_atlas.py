@@ -359,7 +359,7 @@ def test_samples_stay_in_their_texel_and_on_their_triangle(name: str, request: p
 
 def test_samples_are_uniform_by_area(furnace: Scene, furnace_atlas: Atlas) -> None:
     """Senders with many triangles: each triangle gets its share of the area, and so does each quarter of a triangle."""
-    senders = furnace_atlas.senders(8, np.ones(furnace_atlas.count, bool))
+    senders = furnace_atlas.senders(8)
     chosen = np.argsort(senders.area)[-3:]
     rng = np.random.default_rng(1)
     share = np.zeros((len(senders.area), len(furnace.triangles)))
@@ -390,7 +390,7 @@ def test_extreme_numbers_stay_in_their_group(cornell_atlas: Atlas, first: float)
 
 @pytest.mark.parametrize("block", [1, 2, 4, 8])
 def test_senders(cornell_atlas: Atlas, block: int) -> None:
-    senders = cornell_atlas.senders(block, np.ones(cornell_atlas.count, bool))
+    senders = cornell_atlas.senders(block)
     assert senders.area.sum() == pytest.approx(cornell_atlas.area.sum(), rel=1e-12)
     np.testing.assert_allclose(senders.area, np.bincount(senders.of_texel, cornell_atlas.area))
     row, column = np.divmod(cornell_atlas.texel, 64)
@@ -406,15 +406,6 @@ def test_senders(cornell_atlas: Atlas, block: int) -> None:
         assert (cornell_atlas.chart[mine] == senders.chart[sender]).all()
     if block == 1:
         assert len(senders.area) == cornell_atlas.count
-
-
-def test_senders_of_exposed_texels_alone(cornell_atlas: Atlas) -> None:
-    exposed = cornell_atlas.position[:, 1] < 0.3
-    senders = cornell_atlas.senders(4, exposed)
-    assert ((senders.of_texel >= 0) == exposed).all()
-    assert senders.area.sum() == pytest.approx(cornell_atlas.area[exposed].sum(), rel=1e-12)
-    local, _ = senders.sampler.sample(np.arange(len(senders.area)), np.full((len(senders.area), 2), 0.5, np.float32))
-    assert (local[:, 1] + cornell_atlas.centre[1] < 0.32).all()
 
 
 # --- the cache of unwraps ---------------------------------------------------------------------------------------------

@@ -19,7 +19,8 @@ from ddprt.scene.shapes import box, faceted, icosphere, rectangle
 from ddprt.transport.effects import EFFECTS, plan, sees_nothing
 from ddprt.transport.embree import Tracer
 from ddprt.transport.measure import measure
-from ddprt.transport.operator import Operator, find_exposed
+from ddprt.transport.openness import open_atlas
+from ddprt.transport.operator import Operator
 from ddprt.transport.reference import Estimate, on_points, on_texels, trace_reference
 
 CENTRE = parse_lighting({"type": "point", "position": [0, 0, 0], "intensity": [1, 1, 1]})
@@ -220,7 +221,7 @@ def test_reference_agrees_with_a_path_tracer_of_loops(cornell: Scene) -> None:
 def test_gather_rows_agree_with_brute_force(cornell: Scene) -> None:
     """One-hot direct light brings out G: which share of a texel's hemisphere sees each sender."""
     atlas = build_atlas(cornell, 32)
-    senders = atlas.senders(32 // 8, find_exposed(Tracer.of(cornell), atlas))
+    senders = atlas.senders(32 // 8)
     one_hot = (senders.of_texel == np.arange(len(senders.area))[:, None])[..., None] * np.ones(3)
     found = operator(cornell, atlas, one_hot, samples=4096, sender_resolution=8, bounces=1)
     assert found.senders == len(senders.area)
@@ -280,24 +281,13 @@ def test_operator_agrees_with_the_reference(name: str, request: pytest.FixtureRe
 
 
 def test_operator_on_the_cornell_box(cornell: Scene, cornell_atlas: Atlas) -> None:
-    """Texels under the blocks take no part; those that reach half under them still spread light to where nothing sees it."""
-    found = reference(cornell, cornell_atlas, LAMP, 256, seed=2)
-    by_operator = operator(cornell, cornell_atlas, found.direct[None], sender_resolution=64)
-    expected, error = mean(cornell_atlas, found.indirect, found.indirect_variance)
+    """What lies under the blocks takes no part; texels that reach half under them are judged by their open half."""
+    atlas, _ = open_atlas(Tracer.of(cornell), cornell_atlas, cornell)
+    found = reference(cornell, atlas, LAMP, 256, seed=2)
+    by_operator = operator(cornell, atlas, found.direct[None], sender_resolution=64)
+    expected, error = mean(atlas, found.indirect, found.indirect_variance)
     assert error < 0.004 * expected
-    assert mean(cornell_atlas, by_operator.indirect[0])[0] == pytest.approx(expected, rel=0.01)
-
-
-def test_texels_inside_solids_are_found(cornell: Scene, cornell_atlas: Atlas, furnace: Scene, furnace_atlas: Atlas) -> None:
-    exposed = find_exposed(Tracer.of(cornell), cornell_atlas)
-    on_floor = cornell_atlas.position[:, 1] == 0
-    lifted = cornell_atlas.position + np.array([0, 1e-4, 0])
-    hidden = np.array([oracles.inside_a_block(place) for place in lifted])
-    # A texel on the rim (9 mm wide here) may go either way.
-    assert (exposed[~on_floor]).mean() > 0.995
-    assert (exposed[on_floor] == hidden[on_floor]).mean() < 0.05
-    assert (~exposed).sum() > 0.5 * hidden[on_floor].sum() > 10
-    assert find_exposed(Tracer.of(furnace), furnace_atlas).all()
+    assert mean(atlas, by_operator.indirect[0])[0] == pytest.approx(expected, rel=0.01)
 
 
 def test_sender_bias_falls_with_resolution(cornell: Scene, cornell_atlas: Atlas) -> None:

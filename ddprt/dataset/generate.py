@@ -24,12 +24,13 @@ from ddprt.files import write_tensors
 from ddprt.lights import Lighting, lighting_json
 from ddprt.progress import Progress
 from ddprt.sampling.points import Samples, load_samples, place_samples
-from ddprt.scene.atlas import Atlas, build_atlas
+from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
 from ddprt.transport.direct import centred, mean_irradiance, on_texels
 from ddprt.transport.effects import Plan, plan
 from ddprt.transport.embree import Tracer
 from ddprt.transport.measure import measure
+from ddprt.transport.openness import build_open_atlas
 
 _NAMED = 8  # doubtful lightings that a warning spells out
 
@@ -107,8 +108,9 @@ class _Bake:
             stage.facts |= {"lightings": len(entries), **drawn}
         effects = plan(self.scene, [lighting for _, lighting in entries], bounces=self.config.transport.bounces)
         with self.progress.stage("atlas") as stage:
-            atlas = build_atlas(self.scene, self.config.atlas.resolution, self.config.atlas.padding)
-            stage.facts |= {"texels": atlas.count, "texels_per_metre": round(atlas.texels_per_metre, 3)}
+            settings = self.config.atlas
+            atlas, hidden = build_open_atlas(self.tracer, self.scene, settings.resolution, settings.padding)
+            stage.facts |= {"texels": atlas.count, "texels_per_metre": round(atlas.texels_per_metre, 3), **hidden}
         with self.progress.stage("points") as stage:
             samples = self._samples(atlas)
             stage.facts["samples"] = len(samples.position)

@@ -49,6 +49,8 @@ class IndirectBake:
                 self._write(todo, lambda index: [dark] * len(kinds), kinds)
             elif self.dataset.description["transport"]["integrator"] == "reference":
                 self._by_reference(split, todo, kinds, stage)
+            elif self.dataset.description["transport"]["integrator"] == "paths":
+                self._by_paths(split, indices, todo, kinds, stage)
             else:
                 self._by_operator(split, indices, todo, kinds, stage)
             stage.facts["rays"] = self.tracer.rays - before
@@ -111,6 +113,42 @@ class IndirectBake:
             return operator.averaged(read_map(self.dataset.folder / map_name("direct", index))[covered])
 
         return np.concatenate(list(self.tracer.map(work, indices)), 1)
+
+    def _by_paths(self, split: str, indices: list[int], todo: list[int], kinds: list[str], stage: Stage) -> None:
+        from ddprt.transport.paths import choose_samples, trace_paths
+
+        config, halves, stream = self.config.transport, len(kinds), f"{split} paths"
+        given = config.test_samples if split == "test" else config.samples
+        lightings = [self.dataset.lightings[index] for index in indices]
+        scene = self.tracer, self.scene, self.atlas, lightings
+        shared: dict[str, Any] = {"seed": self.config.seed, "bounces": self.effects.bounces}
+        if given == "auto":
+            given, noise = choose_samples(*scene, target=config.target_noise, stream=stream, **shared)
+            stage.facts["noise_expected"] = float(f"{noise:.3g}")
+        samples = max(1, given // halves)
+        stage.facts["samples"] = samples * halves
+        parts = []
+        for half in range(halves):
+            scratch = Scratch(
+                self.dataset.folder / f"{split}-{half}.part",
+                (len(indices), self.atlas.count, 3),
+                {"dataset": self.dataset.description, "paths": samples, "half": half},
+            )
+            for texels in trace_paths(
+                *scene, scratch.maps, samples=samples, stream=f"{stream} {half}", skip=scratch.done, **shared
+            ):
+                scratch.advance()
+                stage.advance(texels)
+            scratch.note()
+            parts.append(scratch)
+
+        def finished(index: int) -> list[np.ndarray]:
+            first, last = (part.maps[indices.index(index)] for part in (parts[0], parts[-1]))
+            return [(first + last) / 2, (first - last) / 2]
+
+        self._write(todo, finished, kinds)
+        for part in parts:
+            part.remove()
 
     def _by_reference(self, split: str, todo: list[int], kinds: list[str], stage: Stage) -> None:
         from ddprt.transport.reference import on_texels, trace_reference

@@ -171,19 +171,20 @@ def spot_check(scene: Scene, data: Dataset, config: Config) -> dict[str, Any]:
     Returns:
       z-scores, the relative bias, and the values of both sides, (lightings, texels, 3); empty where it is switched off.
     """
-    from ddprt.scene.atlas import build_atlas
     from ddprt.transport.effects import plan
     from ddprt.transport.embree import Tracer
+    from ddprt.transport.openness import build_open_atlas
     from ddprt.transport.reference import Estimate, on_texels, trace_reference
 
     test = data.split("test")[: config.report.spot_check_lightings]
     count = min(config.report.spot_check_texels, int(data.covered.sum()))
     if count == 0:
         return {}
-    atlas = build_atlas(scene, config.atlas.resolution, config.atlas.padding)
+    tracer = Tracer.of(scene, config.transport.threads)
+    atlas, _ = build_open_atlas(tracer, scene, config.atlas.resolution, config.atlas.padding)
     rng = seeds.stream(config.seed, "spot check")
     texels = np.sort(rng.choice(atlas.count, count, replace=False))
-    tracer = Tracer.of(scene, config.transport.threads)
+    before = tracer.rays
     bounces = plan(scene, data.lightings, bounces=config.transport.bounces).bounces
 
     def paths(run: str) -> list[Estimate]:
@@ -210,7 +211,7 @@ def spot_check(scene: Scene, data: Dataset, config: Config) -> dict[str, Any]:
         "baked": baked,
         "truth": truth,
         "variance": variance,
-        "rays": tracer.rays,
+        "rays": tracer.rays - before,
     }
 
 

@@ -103,7 +103,7 @@ class Senders:
     """The coarser atlas that light bounces off: blocks of texels that never cross charts.
 
     Attributes:
-      of_texel: sender of each covered texel, -1 for texels that take no part.
+      of_texel: sender of each covered texel.
       area: m².
       albedo: area-weighted mean of the texels' albedo.
       chart, row, column: where each lies, rows and columns counted in blocks.
@@ -195,22 +195,17 @@ class Atlas:
         image[self.texel] = values
         return image.reshape(self.resolution, self.resolution, *values.shape[1:])
 
-    def senders(self, block: int, exposed: Bool[np.ndarray, " texels"]) -> Senders:
-        """Groups the exposed texels (at least one) into squares of `block` texels a side."""
+    def senders(self, block: int) -> Senders:
+        """Groups the texels into squares of `block` texels a side, within each chart."""
         row, column = np.divmod(self.texel, self.resolution)
         across = -(-self.resolution // block)
         key = (self.chart.astype(np.int64) * across + row // block) * across + column // block
-        keys, group = np.unique(key[exposed], return_inverse=True)
-        weight = self.area[exposed]
-        area = np.bincount(group, weight)
-        albedo = np.stack([np.bincount(group, weight * self.albedo[exposed, c]) for c in range(3)], 1) / area[:, None]
-        of_texel = np.full(self.count, -1, np.int32)
-        of_texel[exposed] = group
-        kept = exposed[self.piece_texel]
-        pieces = self.piece_texel[kept], self.piece_area[kept], self.piece_corners[kept], self.piece_triangle[kept]
-        sampler = SurfaceSampler.build(of_texel[pieces[0]], *pieces[1:])
+        keys, group = np.unique(key, return_inverse=True)
+        area = np.bincount(group, self.area)
+        albedo = np.stack([np.bincount(group, self.area * self.albedo[:, c]) for c in range(3)], 1) / area[:, None]
+        sampler = SurfaceSampler.build(group[self.piece_texel], self.piece_area, self.piece_corners, self.piece_triangle)
         place = keys // across**2, keys // across % across, keys % across
-        return Senders(of_texel, area, albedo, *place, block, sampler)
+        return Senders(group.astype(np.int32), area, albedo, *place, block, sampler)
 
 
 def build_atlas(scene: Scene, resolution: int = 256, padding: int = 2) -> Atlas:

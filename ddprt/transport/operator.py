@@ -17,15 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from ddprt.axes import Bool, Float32, Float64, Int
+from ddprt.axes import Float32, Float64, Int
 from ddprt.compiled import compiled
 from ddprt.scene.atlas import Atlas, Senders
 from ddprt.transport.embree import Tracer
-from ddprt.transport.gather import BACK, Landing, Receivers, seen_from
+from ddprt.transport.gather import Landing, Receivers, seen_from
 
 _SENDER_RESOLUTION = 128  # senders along a side where nothing else is asked for
-_PROBES = 16  # rays that tell an open texel from one inside a solid
-_COARSE = 4096  # most blocks that bounces are solved on: 64 MiB of matrix
+_COARSE = 3000  # most blocks that bounces are solved on: 36 MB of matrix
 _COARSE_SAMPLES = 256  # rays of each: their noise is averaged once more over all that a texel sees
 _TOLERANCE = 1e-4  # of a lighting's largest indirect value: where the series stops
 _MAX_BOUNCES = 512  # a closed white room never ends; what is left is reported
@@ -82,11 +81,10 @@ class Operator:
     @classmethod
     def of(cls, tracer: Tracer, atlas: Atlas, sender_resolution: int = 0) -> "Operator":
         """The operator of a scene, with so many senders along a side of the atlas; 0: at most 128."""
-        exposed = find_exposed(tracer, atlas)
         block = max(1, round(atlas.resolution / (sender_resolution or min(atlas.resolution, _SENDER_RESOLUTION))))
-        senders = coarse = atlas.senders(block, exposed)
-        while coarse.count > _COARSE:
-            coarse = atlas.senders(2 * coarse.block, exposed)
+        senders = coarse = atlas.senders(block)
+        while coarse.count > _COARSE and coarse.block < atlas.resolution:  # charts are never joined, however many there are
+            coarse = atlas.senders(coarse.block + block)
         return cls(tracer, atlas, senders, coarse)
 
     @cached_property
@@ -137,9 +135,12 @@ class Operator:
 
     def _between_senders(
         self, radiosity: Float32[np.ndarray, "senders columns"], seed: int, stream: str
-    ) -> tuple[Float32[np.ndarray, "coarse coarse"], Float32[np.ndarray, "coarse columns"]]:
-        """G among the coarse blocks, and what they gather from the senders."""
+    ) -> tuple[Any, Float32[np.ndarray, "coarse columns"]]:
+        """G among the coarse blocks (sparse where charts are too many), and what they gather from the senders."""
         coarse = self.coarse
+        from scipy.sparse import csr_array, vstack
+
+        sparse = coarse.count > 4 * _COARSE
         place = np.arange(coarse.count), coarse.row, coarse.column
         receivers = Receivers.of(coarse.sampler, *place, _COARSE_SAMPLES, seed, f"{stream} senders")
         home = np.zeros(self.senders.count, np.int32)
@@ -147,18 +148,18 @@ class Operator:
         home[self.senders.of_texel[kept]] = coarse.of_texel[kept]
         table = _with_dark_row(radiosity)
 
-        def work(tile: slice) -> tuple[np.ndarray, np.ndarray]:
+        def work(tile: slice) -> tuple[Any, np.ndarray]:
             count = tile.stop - tile.start
             rows = np.zeros((count, coarse.count), np.float32)
             sums = np.zeros((count, table.shape[1]), np.float32)
             for cells, _ in seen_from(self.tracer, receivers, tile, self.landing):
                 _count_seen(cells, home, rows)
                 _add_seen(cells, table, sums)
-            return rows * np.float32(1 / _COARSE_SAMPLES), sums * np.float32(1 / _COARSE_SAMPLES)
+            rows *= np.float32(1 / _COARSE_SAMPLES)
+            return csr_array(rows) if sparse else rows, sums * np.float32(1 / _COARSE_SAMPLES)
 
-        parts = list(self.tracer.map(work, receivers.tiles()))
-        gather, sums = (np.concatenate(column) for column in zip(*parts, strict=True))
-        return gather, sums
+        rows, sums = zip(*self.tracer.map(work, receivers.tiles()), strict=True)
+        return (vstack(rows, format="csr") if sparse else np.concatenate(rows)), np.concatenate(sums)
 
     def gather(
         self,
@@ -186,10 +187,7 @@ class Operator:
         def work(item: tuple[int, Receivers, slice]) -> int:
             index, receivers, tile = item
             if index >= skip:
-                sums = np.zeros((tile.stop - tile.start, table.shape[1]), np.float32)
-                for cells, _ in seen_from(self.tracer, receivers, tile, self.landing):
-                    _add_seen(cells, table, sums)
-                _store(sums, receivers.patch[tile], np.float32(1 / receivers.samples), out)
+                _store(self._sums(receivers, tile, table), receivers.patch[tile], np.float32(1 / receivers.samples), out)
             return tile.stop - tile.start
 
         groups = (
@@ -209,12 +207,19 @@ class Operator:
         stream: str,
     ) -> Float32[np.ndarray, "lightings chosen 3"]:
         """Irradiance of a few texels in rising order, with as many rays from each."""
-        rays = np.zeros(self.atlas.count, np.int64)
-        rays[texels] = samples
-        out = np.zeros((radiosity.shape[1] // 3, self.atlas.count, 3), np.float32)
-        for _ in self.gather(radiosity, out, rays, seed=seed, stream=stream):
-            pass
-        return out[:, texels]
+        receivers = Receivers.texels(self.atlas, samples, seed, stream, texels)
+        table = _with_dark_row(radiosity)
+        parts = list(self.tracer.map(lambda tile: self._sums(receivers, tile, table), receivers.tiles()))
+        return np.concatenate(parts).reshape(len(texels), -1, 3).swapaxes(0, 1) * np.float32(1 / samples)
+
+    def _sums(
+        self, receivers: Receivers, tile: slice, table: Float32[np.ndarray, "senders_and_dark columns"]
+    ) -> Float32[np.ndarray, "tile columns"]:
+        """The radiosity that the rays of a tile meet, added up."""
+        sums = np.zeros((tile.stop - tile.start, table.shape[1]), np.float32)
+        for cells, _ in seen_from(self.tracer, receivers, tile, self.landing):
+            _add_seen(cells, table, sums)
+        return sums
 
     def pilot(self, radiosity: Float32[np.ndarray, "senders columns"], samples: int, *, seed: int, stream: str) -> Pilot:
         """A first look from every texel, with random numbers of its own."""
@@ -233,18 +238,6 @@ class Operator:
 
         parts = list(self.tracer.map(work, receivers.tiles()))
         return Pilot(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-
-
-def find_exposed(tracer: Tracer, atlas: Atlas) -> Bool[np.ndarray, " texels"]:
-    """Texels in the open: at least half of what they see along 16 rays are fronts, or nothing."""
-    receivers = Receivers.texels(atlas, _PROBES, 0, "exposed")
-    landing = Landing.of(atlas, np.zeros(atlas.count, np.int32))
-
-    def work(tile: slice) -> Bool[np.ndarray, " tile"]:
-        backs = sum((cells == BACK).sum(0) for cells, _ in seen_from(tracer, receivers, tile, landing))
-        return 2 * backs <= _PROBES
-
-    return np.concatenate(list(tracer.map(work, receivers.tiles())))
 
 
 def _remainder(largest: float, last: np.ndarray, total: np.ndarray) -> float:
