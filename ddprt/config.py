@@ -97,7 +97,7 @@ class PointsConfig(Section):
 class TransportConfig(Section):
     """How light is simulated."""
 
-    integrator: Literal["auto", "operator", "reference"] = Field(
+    integrator: Literal["auto", "operator", "paths", "reference"] = Field(
         "auto", description="auto takes the cheapest that is valid; reference is unbiased path tracing per lighting"
     )
     samples: Literal["auto"] | Annotated[int, Field(ge=1, le=65536)] = Field(
