@@ -112,6 +112,7 @@ class TransportConfig(Section):
         description="train and validation: texels share rays within this share of the harmonic mean distance to what they see; "
         "0: never",
     )
+    denoise: bool = Field(False, description="train and validation: filter maps by Open Image Denoise (extra denoise)")
     adaptive: bool = Field(True, description="train and validation: more rays where footprints are small and light varies")
     direct_samples: int = Field(4, ge=1, le=1024, description="shadow rays per texel and light")
     sender_resolution: int = Field(

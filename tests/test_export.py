@@ -12,7 +12,7 @@ import ddprt
 from ddprt.config import load_config
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
-from ddprt.export.gutter import fill_gutter
+from ddprt.scene.gutter import fill_gutter
 from ddprt.export.textures import export_textures
 from ddprt.scene.mesh import Scene
 

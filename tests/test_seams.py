@@ -12,7 +12,7 @@ import pytest
 import ddprt
 from ddprt.config import load_config
 from ddprt.dataset.store import Dataset
-from ddprt.export.gutter import fill_gutter
+from ddprt.scene.gutter import fill_gutter
 from ddprt.export.seams import PULL, Seams, Stitcher, find_seams
 from ddprt.export.textures import export_textures
 from ddprt.runtime.model import Model

@@ -16,6 +16,7 @@ import numpy as np
 from ddprt import __version__, seeds
 from ddprt.config import Config
 from ddprt.dataset import store
+from ddprt.dataset.denoise import find_denoiser
 from ddprt.dataset.indirect import IndirectBake
 from ddprt.dataset.splits import SPLITS, Splits, choose_lightings, doubt
 from ddprt.dataset.store import Dataset, Manifest, map_name
@@ -103,6 +104,8 @@ class _Bake:
         self.tracer = Tracer.of(scene, config.transport.threads)
 
     def run(self, given: Sequence[Lighting] | Splits | None, keep_alive: Any) -> Dataset:
+        if self.config.transport.denoise:
+            find_denoiser()
         with self.progress.stage("lightings") as stage:
             entries, drawn = choose_lightings(given, self.config.lightings, self.scene, self.tracer, self.config.seed)
             stage.facts |= {"lightings": len(entries), **drawn}

@@ -1,4 +1,4 @@
-"""Indirect lightmaps of a dataset: by the operator for all lightings at once, or lighting by lighting by the reference."""
+"""Indirect lightmaps of a dataset: by the operator or by shared paths for all lightings at once, or one by one."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,6 +9,7 @@ import numpy as np
 from ddprt import seeds
 from ddprt.axes import Float32
 from ddprt.config import Config
+from ddprt.dataset.denoise import denoised
 from ddprt.dataset.scratch import Scratch
 from ddprt.dataset.store import Dataset, Manifest, map_name, read_map, write_map
 from ddprt.progress import Progress, Stage
@@ -16,6 +17,8 @@ from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
 from ddprt.transport.effects import Plan
 from ddprt.transport.embree import Tracer
+
+_REFERENCE_SAMPLES = 512  # paths of the reference where nothing else is asked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,15 +179,14 @@ class IndirectBake:
 
     def _write(self, indices: Sequence[int], maps: Any, kinds: list[str]) -> None:
         """Writes the maps of lightings side by side, and names them in order."""
+        filtered = self.config.transport.denoise and "noise" not in kinds  # never what scores are computed on
 
         def work(index: int) -> int:
             for kind, values in zip(kinds, maps(index), strict=False):
-                write_map(self.dataset.folder / map_name(kind, index), self.atlas.image(values))
+                smooth = denoised(self.atlas, values) if filtered else values
+                write_map(self.dataset.folder / map_name(kind, index), self.atlas.image(smooth))
             return index
 
         for index in self.tracer.map(work, indices):
             for kind in kinds:
                 self.manifest.add(map_name(kind, index))
-
-
-_REFERENCE_SAMPLES = 512

@@ -12,12 +12,12 @@ import numpy as np
 
 from ddprt import __version__
 from ddprt.errors import UserError
-from ddprt.export.gutter import fill_gutter
 from ddprt.export.seams import Stitcher, find_seams
 from ddprt.files import write_tensors, write_text
 from ddprt.methods.svd_ridge import LinearTransfer
 from ddprt.runtime.model import Model
 from ddprt.scene.exr import write_exr
+from ddprt.scene.gutter import fill_gutter
 
 SCHEMA = 1
 LAYER = 4  # bases per RGBA texture
