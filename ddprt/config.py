@@ -108,7 +108,7 @@ class TransportConfig(Section):
     )
     target_noise: float = Field(0.01, ge=1e-4, le=1.0, description="relative RMSE of the maps that auto samples aim at")
     footprint: Unit = Field(
-        0.1,
+        0.05,
         description="train and validation: texels share rays within this share of the harmonic mean distance to what they see; "
         "0: never",
     )

@@ -17,10 +17,10 @@ from scipy.ndimage import map_coordinates
 import ddprt
 from ddprt import seeds
 from ddprt.config import load_config
-from ddprt.export.gutter import fill_gutter
 from ddprt.export.seams import Stitcher, find_seams
 from ddprt.report.view import Camera, exposure_for, first_fronts, png, tonemap
 from ddprt.scene.atlas import Atlas, build_atlas
+from ddprt.scene.gutter import fill_gutter
 from ddprt.scene.mesh import Scene
 from ddprt.transport.embree import Tracer
 

@@ -12,8 +12,8 @@ import ddprt
 from ddprt.config import load_config
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
-from ddprt.scene.gutter import fill_gutter
 from ddprt.export.textures import export_textures
+from ddprt.scene.gutter import fill_gutter
 from ddprt.scene.mesh import Scene
 
 DOCS = Path(__file__).parent.parent / "docs" / "export.md"

@@ -12,12 +12,12 @@ import pytest
 import ddprt
 from ddprt.config import load_config
 from ddprt.dataset.store import Dataset
-from ddprt.scene.gutter import fill_gutter
 from ddprt.export.seams import PULL, Seams, Stitcher, find_seams
 from ddprt.export.textures import export_textures
 from ddprt.runtime.model import Model
 from ddprt.scene.atlas import Atlas, build_atlas
 from ddprt.scene.exr import read_exr
+from ddprt.scene.gutter import fill_gutter
 from ddprt.scene.mesh import Scene
 
 LOW = np.array([[2.5, 2.5], [7.5, 2.5], [7.5, 7.5], [2.5, 7.5]])  # a quad on a 20 x 20 atlas, in texels: its edges on centres

@@ -47,6 +47,7 @@ class IndirectBake:
             return
         with self.progress.stage(f"indirect {split}", len(kinds) * self.atlas.count) as stage:
             before = self.tracer.rays
+            stage.facts["integrator"] = self.dataset.description["transport"]["integrator"]
             if self.effects.bounces == 0:
                 dark = np.zeros((self.atlas.count, 3), np.float32)
                 self._write(todo, lambda index: [dark] * len(kinds), kinds)
@@ -128,6 +129,11 @@ class IndirectBake:
         if given == "auto":
             given, noise = choose_samples(*scene, target=config.target_noise, stream=stream, **shared)
             stage.facts["noise_expected"] = float(f"{noise:.3g}")
+            if noise > 1.5 * config.target_noise:
+                self.progress.say(
+                    f"warning: {given} paths per texel leave about {100 * noise:.2g} % of noise, and no more are traced "
+                    "unasked; set transport.samples, raise transport.target_noise, or use the operator"
+                )
         samples = max(1, given // halves)
         stage.facts["samples"] = samples * halves
         parts = []

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -36,11 +37,15 @@ class Scratch:
             entry = json.loads(self.journal.read_text("utf-8"))
             if entry["key"] == self.key and path.stat().st_size == 4 * int(np.prod(shape)):
                 self.done = int(entry["tiles"])
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, OverflowError):
             pass  # nothing to go on from
         make_folder(path.parent)
         try:
-            self.maps = np.memmap(path, np.float32, "r+" if self.done else "w+", shape=shape)
+            if not self.done:
+                self.journal.unlink(missing_ok=True)  # it must never speak for what comes now
+                with path.open("wb") as file:
+                    os.posix_fallocate(file.fileno(), 0, 4 * int(np.prod(shape)))  # full: an error now, no signal later
+            self.maps = np.memmap(path, np.float32, "r+", shape=shape)
         except OSError as error:
             raise UserError(f"{path}: cannot be written ({error.strerror or error}); free some space") from None
         self._open = self.done
@@ -53,7 +58,10 @@ class Scratch:
 
     def note(self) -> None:
         """Writes all that is done to disk and into the journal."""
-        self.maps.flush()
+        try:
+            self.maps.flush()
+        except OSError as error:
+            raise UserError(f"{self.path}: cannot be written ({error.strerror or error}); free some space") from None
         self.done, self._noted = self._open, time.monotonic()
         write_text(self.journal, json.dumps({"key": self.key, "tiles": self.done}))
 

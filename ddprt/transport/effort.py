@@ -1,5 +1,6 @@
 """How many rays each texel gets: as many as a target for the noise asks, and more where they are needed."""
 
+import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,8 +14,10 @@ from ddprt.transport.operator import Operator
 
 _PILOT = 8  # rays of every texel that tell distances and variances, and are thrown away
 _PROBED = 1024  # texels whose noise is measured
-_FEW, _MANY = 16, 64  # rays there, twice each
-_WIDER = 2.0  # times the footprint: over how far measured variances are averaged
+_TIMED = 1024  # texels that tell how long a ray takes
+_LIGHTINGS = 32  # that are looked at
+_FEW, _MANY = 24, 96  # rays there, twice each; no powers of two, which do 10 % better than what lies between
+_WIDE = 0.4  # of the harmonic mean distance: over how far variances seen by few rays are averaged
 _LEVELS = 2.0 ** np.arange(-2, 4)  # rays of a texel over the mean
 _WORTHWHILE = 0.9  # of the even variance: what an uneven share must reach to be used
 _MOST = 65536
@@ -27,7 +30,7 @@ class Choice:
     Attributes:
       rays: of each texel.
       footprints: neighbours that share rays; None where none do.
-      facts: mean rays, expected relative RMSE of the maps, variance over that of an even share.
+      facts: mean rays, expected relative RMSE of the maps, seconds at the pilot's rate, variance over that of an even share.
     """
 
     rays: Int[np.ndarray, " texels"]
@@ -59,12 +62,17 @@ def choose_rays(
     halves, samples = (2, config.test_samples) if held_out else (1, config.samples)
     footprint, adaptive = (0.0, False) if held_out else (config.footprint, config.adaptive)
     area = operator.atlas.area
+    each = _seconds_per_ray(operator, radiosity, seed)
+    radiosity = _some(radiosity)
     pilot = operator.pilot(radiosity, _PILOT, seed=seed, stream=stream)
     footprints = find_footprints(operator.atlas, pilot.nearness, footprint) if footprint > 0 else None
     burden = footprints.burden(area) if footprints else area
-    variance = _smoothed(operator, pilot.nearness, pilot.variance, _WIDER * footprint)
-    few, power = _measure_noise(operator, radiosity, burden, variance, seed, stream)
+    variance = _smoothed(operator, pilot.nearness, pilot.variance, _WIDE)
+    few, power, texels, error = _measure_noise(operator, radiosity, burden, variance, seed, stream)
     ratio, share = allot(variance, burden, power) if adaptive else (1.0, np.ones(len(area)))
+    if ratio < 1 and error.any():  # the pilot chose, so only the probes can tell what that is worth
+        ratio = float(error @ share[texels] ** -power / error.sum())
+        ratio, share = (ratio, share) if ratio < _WORTHWHILE else (1.0, np.ones(len(area)))
 
     if samples == "auto":
         wanted = halves * _FEW * (few * ratio / halves / config.target_noise**2) ** (1 / power)
@@ -72,6 +80,7 @@ def choose_rays(
     rays = np.maximum(1, np.rint(share * (samples / halves))).astype(np.int64)
     expected = np.sqrt(few * ratio * (samples / halves / _FEW) ** -power / halves)
     facts = {"samples": round(float(rays.mean()) * halves, 1), "noise_expected": float(f"{expected:.3g}")}
+    facts["seconds_expected"] = float(f"{each * rays.sum() * halves:.2g}")
     if adaptive:
         facts["variance_over_even"] = round(ratio, 3)
     return Choice(rays, footprints, facts)
@@ -112,6 +121,21 @@ def _rounded(share: Float64[np.ndarray, " texels"]) -> Float64[np.ndarray, " tex
     return _LEVELS[np.clip(step, 0, len(_LEVELS) - 1).astype(int)]
 
 
+def _some(radiosity: Float32[np.ndarray, "senders columns"]) -> Float32[np.ndarray, "senders chosen"]:
+    """The columns of a few lightings, evenly taken: enough to tell what rays are needed."""
+    lightings = radiosity.shape[1] // 3
+    chosen = np.unique(np.linspace(0, lightings - 1, min(lightings, _LIGHTINGS)).astype(int))
+    return np.ascontiguousarray(radiosity.reshape(len(radiosity), -1, 3)[:, chosen].reshape(len(radiosity), -1))
+
+
+def _seconds_per_ray(operator: Operator, radiosity: Float32[np.ndarray, "senders columns"], seed: int) -> float:
+    """With all lightings, on all cores."""
+    texels = np.linspace(0, operator.atlas.count - 1, min(operator.atlas.count, _TIMED)).astype(int)
+    begun = time.perf_counter()
+    operator.gather_some(radiosity, texels, _MANY, seed=seed, stream="rate")
+    return (time.perf_counter() - begun) / (_MANY * len(texels))
+
+
 def _smoothed(
     operator: Operator, nearness: Float64[np.ndarray, " texels"], variance: Float64[np.ndarray, " texels"], share: float
 ) -> Float64[np.ndarray, " texels"]:
@@ -127,8 +151,8 @@ def _measure_noise(
     variance: Float64[np.ndarray, " texels"],
     seed: int,
     stream: str,
-) -> tuple[float, float]:
-    """Squared relative RMSE of maps at `_FEW` rays per texel, and the power with which it falls.
+) -> tuple[float, float, Int[np.ndarray, " probed"], Float64[np.ndarray, " probed"]]:
+    """Squared relative RMSE of maps at `_FEW` rays per texel, the power with which it falls, and each probed texel's share.
 
     Texels are probed where they matter: drawn with a probability near their share of the error, and weighted accordingly.
     """
@@ -145,12 +169,11 @@ def _measure_noise(
             runs[rays, run] = operator.gather_some(radiosity, texels, rays, seed=seed, stream=f"{stream} probe {run}")
     mean = float((weight * area[texels]) @ np.mean(list(runs.values()), axis=0).sum((0, 2))) / (3 * lightings * area.sum())
     if mean == 0:
-        return 0.0, 1.0
-    error = [
-        float((weight * burden[texels]) @ (((runs[rays, 0] - runs[rays, 1]) / mean) ** 2).sum((0, 2)) / 2)
-        / (3 * lightings * area.sum())
-        for rays in (_FEW, _MANY)
-    ]
-    if not all(error):
-        return error[0], 1.0
-    return error[0], float(np.clip(np.log(error[0] / error[1]) / np.log(_MANY / _FEW), 1.0, 1.8))
+        return 0.0, 1.0, texels, np.zeros(len(texels))
+    scale = weight * burden[texels] / (2 * 3 * lightings * area.sum())
+    each = [scale * (((runs[rays, 0] - runs[rays, 1]) / mean) ** 2).sum((0, 2)) for rays in (_FEW, _MANY)]
+    few, many = (float(part.sum()) for part in each)
+    if not (few and many):
+        return few, 1.0, texels, each[0]
+    power = float(np.clip(np.log(few / many) / np.log(_MANY / _FEW), 1.0, 1.8))
+    return few, power, texels, each[0] / few + each[1] / many

@@ -16,7 +16,6 @@ from ddprt.axes import Float, Float32, Float64, Int32
 from ddprt.compiled import compiled
 from ddprt.scene.atlas import Atlas
 
-SHARE = 0.1  # of the harmonic mean distance: standard deviation of a footprint
 _REACH = 2  # texels that a footprint may extend to each side
 _TAPS = (2 * _REACH + 1) ** 2
 
@@ -48,7 +47,7 @@ class Footprints:
         return result
 
 
-def find_footprints(atlas: Atlas, nearness: Float[np.ndarray, " texels"], share: float = SHARE) -> Footprints:
+def find_footprints(atlas: Atlas, nearness: Float[np.ndarray, " texels"], share: float) -> Footprints:
     """Footprints from what texels see.
 
     Args:

@@ -59,10 +59,18 @@ class Pattern:
         blocks = self.disk.shape[1]
         tile = (row // 16).astype(np.uint64) << np.uint64(32) | (column // 16).astype(np.uint64)
         key, of_tile = np.unique(tile, return_inverse=True)
-        rng = np.random.default_rng([seed, 16])
-        mask, turn = rng.integers(0, blocks, len(key)), 2 * np.pi * rng.random(len(key))
+        bits = _scrambled(_scrambled(key) ^ np.uint64(seed))
+        mask, turn = (bits % np.uint64(blocks)).astype(np.int64), 2 * np.pi * (bits >> np.uint64(11)) * 2.0**-53
         block = (_interleaved(row % 16, column % 16) % blocks) ^ mask[of_tile]
         return block.astype(np.int32), np.stack([np.cos(turn), np.sin(turn)], 1).astype(np.float32)[of_tile]
+
+
+def _scrambled(key: np.ndarray) -> np.ndarray:
+    """Random 64 bits for each key, whichever others are asked for (SplitMix64)."""
+    key = key + np.uint64(0x9E3779B97F4A7C15)
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        key = (key ^ (key >> np.uint64(shift))) * np.uint64(factor)
+    return key ^ (key >> np.uint64(31))
 
 
 def _interleaved(row: np.ndarray, column: np.ndarray) -> np.ndarray:
