@@ -24,15 +24,15 @@ class SurfaceSampler:
 
     Attributes:
       start: first piece of each group, and the number of pieces at the end.
-      reach: group index plus the share of the group's area up to and with this piece: rising from 0 to the group count.
+      reach: share of its group's area up to and with each piece, rising to 1.
       width: share of its group's area that each piece has.
       place: first corner of each piece and the edges to the other two, nine numbers in a row, metres.
       triangle: mesh triangle of each piece.
     """
 
     start: Int[np.ndarray, " groups_and_end"]
-    reach: Float64[np.ndarray, " pieces"]
-    width: Float64[np.ndarray, " pieces"]
+    reach: Float32[np.ndarray, " pieces"]
+    width: Float32[np.ndarray, " pieces"]
     place: Float32[np.ndarray, "pieces 9"]
     triangle: Int32[np.ndarray, " pieces"]
 
@@ -51,11 +51,11 @@ class SurfaceSampler:
         total = np.add.reduceat(area, start[:-1])
         running = np.cumsum(area)
         before = running[start[:-1]] - area[start[:-1]]
-        reach = group + np.clip((running - before[group]) / total[group], 0, 1)
-        reach[start[1:] - 1] = group[start[1:] - 1] + 1
+        reach = np.clip((running - before[group]) / total[group], 0, 1)
+        reach[start[1:] - 1] = 1
         place[:, 3:6] -= place[:, :3]
         place[:, 6:] -= place[:, :3]
-        return cls(start, reach, area / total[group], place, triangle)
+        return cls(start, reach.astype(np.float32), (area / total[group]).astype(np.float32), place, triangle)
 
     def sample(
         self, group: Int[np.ndarray, " n"], u: Float32[np.ndarray, "n 2"]
@@ -63,6 +63,15 @@ class SurfaceSampler:
         """Positions (metres) and mesh triangles, one in each given group."""
         positions, faces = np.empty((len(group), 3), np.float32), np.empty(len(group), np.int32)
         _place(group, u, self.start, self.reach, self.width, self.place, self.triangle, positions, faces)
+        return positions, faces
+
+    def spread(
+        self, group: Int[np.ndarray, " tile"], u: Float32[np.ndarray, "samples blocks 2"], block: Int32[np.ndarray, " tile"]
+    ) -> tuple[Float32[np.ndarray, "rays 3"], Int32[np.ndarray, " rays"]]:
+        """The same for a tile of groups and some samples, group after group for each sample; each group has its block of `u`."""
+        rays = len(u) * len(group)
+        positions, faces = np.empty((rays, 3), np.float32), np.empty(rays, np.int32)
+        _spread(group, u, block, self.start, self.reach, self.width, self.place, self.triangle, positions, faces)
         return positions, faces
 
 
@@ -78,24 +87,59 @@ def _place(
     positions: np.ndarray,
     faces: np.ndarray,
 ) -> None:
-    """`SurfaceSampler.sample`: the first number chooses a piece and is used again within it; see `warp.sample_triangle`."""
-    one = np.float32(1)
     for i in range(len(group)):
-        choice = group[i] + np.float64(u[i, 0])
-        low, high = start[group[i]], start[group[i] + 1] - 1
-        while low < high:
-            middle = (low + high) // 2
-            if choice < reach[middle]:
-                high = middle
-            else:
-                low = middle + 1
-        within = np.float32((choice - reach[low] + width[low]) / max(width[low], 1e-300))
-        x, y = min(max(within, np.float32(0)), one), u[i, 1]
-        smaller = np.float32(0.5) * min(x, y)
-        second, third = x - smaller, y - smaller
-        for axis in range(3):
-            positions[i, axis] = place[low, axis] + second * place[low, 3 + axis] + third * place[low, 6 + axis]
-        faces[i] = triangle[low]
+        faces[i] = triangle[_point(np.uint64(group[i]), u[i, 0], u[i, 1], start, reach, width, place, positions[i])]
+
+
+@compiled
+def _spread(
+    group: np.ndarray,
+    u: np.ndarray,
+    block: np.ndarray,
+    start: np.ndarray,
+    reach: np.ndarray,
+    width: np.ndarray,
+    place: np.ndarray,
+    triangle: np.ndarray,
+    positions: np.ndarray,
+    faces: np.ndarray,
+) -> None:
+    i = 0
+    for sample in range(len(u)):
+        for k in range(len(group)):
+            pair = u[sample, np.uint32(block[k])]
+            faces[i] = triangle[_point(np.uint64(group[k]), pair[0], pair[1], start, reach, width, place, positions[i])]
+            i += 1
+
+
+@compiled
+def _point(
+    group: int,
+    u: float,
+    v: float,
+    start: np.ndarray,
+    reach: np.ndarray,
+    width: np.ndarray,
+    place: np.ndarray,
+    position: np.ndarray,
+) -> int:
+    """A point of a group, and its piece: the first number chooses it and is used again within; see `warp.sample_triangle`."""
+    # Unsigned indices spare the look at whether they count from the end.
+    low, high = np.uint64(start[group]), np.uint64(start[group + np.uint64(1)] - 1)
+    while low < high:
+        middle = (low + high) >> np.uint64(1)
+        if u < reach[middle]:
+            high = middle
+        else:
+            low = middle + np.uint64(1)
+    within = (u - reach[low] + width[low]) / max(width[low], np.float32(1e-30))
+    x = min(max(within, np.float32(0)), np.float32(1))
+    smaller = np.float32(0.5) * min(x, v)
+    second, third = x - smaller, v - smaller
+    corner = place[low]
+    for axis in range(3):
+        position[axis] = corner[axis] + second * corner[3 + axis] + third * corner[6 + axis]
+    return low
 
 
 @dataclass(frozen=True, eq=False)

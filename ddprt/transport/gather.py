@@ -175,8 +175,7 @@ def seen_from(
     step = max(1, _CALL // len(block))
     for start in range(0, receivers.samples, step):
         chunk = slice(start, start + step)
-        u = np.take(pattern.place[chunk], block, axis=1)
-        origins, triangle = receivers.sampler.sample(np.tile(patch, len(u)), u.reshape(-1, 2))
+        origins, triangle = receivers.sampler.spread(patch, pattern.place[chunk], block)
         directions = np.empty_like(origins)
         _aim(pattern.disk[chunk], block, receivers.turn[tile], triangle, tracer.frames, tracer.offset, origins, directions)
         triangle, second, third, distance = tracer.first(origins, directions)
@@ -201,8 +200,8 @@ def _aim(
     for sample in range(samples):
         for receiver in range(tile):
             ray = sample * tile + receiver
-            frame = frames[triangle[ray]]
-            x, y = disk[sample, block[receiver], 0], disk[sample, block[receiver], 1]
+            frame, point = frames[np.uint32(triangle[ray])], disk[sample, np.uint32(block[receiver])]
+            x, y = point[0], point[1]
             cosine, sine = turn[receiver, 0], turn[receiver, 1]
             x, y = cosine * x - sine * y, sine * x + cosine * y
             z = np.sqrt(max(np.float32(0), np.float32(1) - x * x - y * y))
@@ -223,7 +222,7 @@ def _land(
     part: np.ndarray,
     cells: np.ndarray,
 ) -> None:
-    """Cell at each hit."""
+    """Cell at each hit. Unsigned indices spare the look at whether they count from the end."""
     last = len(cell) - 1
     for ray in range(len(cells)):
         hit = triangle[ray]
