@@ -3,7 +3,7 @@
 Question: seconds at equal error, of the relit result and of each map, against Mitsuba 3, which renders one lighting at a time;
           the share of Embree's own rate; the bias of the operator; what texels, rays, lightings and triangles cost.
 Command:  python experiments/bake_speed.py --quick            under a minute; last line is JSON
-          python experiments/bake_speed.py compare [SCENE]    the whole comparison (half an hour), a line of JSON at its end
+          python experiments/bake_speed.py compare SCENE [full]    the whole comparison, minutes; a line of JSON at its end
           python experiments/bake_speed.py scaling            slopes over texels, rays, lightings and triangles
           python experiments/bake_speed.py bias               operator against reference on every library scene
 Answer:   docs/baking.md
@@ -367,15 +367,16 @@ def quick() -> None:
     print(json.dumps({key: float(f"{value:.4g}") for key, value in answer.items()}))
 
 
-def compare(name: str = "cornell") -> None:
+def compare(name: str = "cornell", extent: str = "brief") -> None:
     """Equal error over paths, and over the number of lightings."""
-    both = Comparison(name, 1024, 16, (2048, 16384))
+    full = extent == "full"
+    both = Comparison(name, 1024 if full else 128, 16, (2048, 16384))
     both.default()
-    learned = {16: (64, 128, 256), 64: (64, 128), 256: (128,)}
+    learned = {16: (64, 128, 256), 64: (64, 128), 256: (128,)} if full else {16: (128,), 64: (128,)}
     theirs = {paths: both.theirs(paths, max(numbers), numbers) for paths, numbers in learned.items()}
     theirs |= {paths: both.theirs(paths, lightings) for paths, lightings in ((1024, 4), (4096, 2))}
     table = []
-    for count in (1, 4, 16, 64, 128, 256, 1024):
+    for count in (1, 4, 16, 64, 128, 256, 1024) if full else (1, 16, 128):
         ours = both.ours((8, 16, 64, 256, 1024), count, learn=count >= 64)
         for paths, (run, relit) in theirs.items():
             entry = {"lightings": count, "paths": paths}

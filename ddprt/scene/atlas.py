@@ -68,7 +68,7 @@ class SurfaceSampler:
     def spread(
         self, group: Int[np.ndarray, " tile"], u: Float32[np.ndarray, "samples blocks 2"], block: Int32[np.ndarray, " tile"]
     ) -> tuple[Float32[np.ndarray, "rays 3"], Int32[np.ndarray, " rays"]]:
-        """The same for a tile of groups and some samples, group after group for each sample; each group has its block of `u`."""
+        """The same for a tile of groups and some samples, sample by sample; each group has its block of `u`."""
         rays = len(u) * len(group)
         positions, faces = np.empty((rays, 3), np.float32), np.empty(rays, np.int32)
         _spread(group, u, block, self.start, self.reach, self.width, self.place, self.triangle, positions, faces)
@@ -114,15 +114,15 @@ def _spread(
 
 @compiled
 def _point(
-    group: int,
-    u: float,
-    v: float,
+    group: np.integer,
+    u: np.floating,
+    v: np.floating,
     start: np.ndarray,
     reach: np.ndarray,
     width: np.ndarray,
     place: np.ndarray,
     position: np.ndarray,
-) -> int:
+) -> np.integer:
     """A point of a group, and its piece: the first number chooses it and is used again within; see `warp.sample_triangle`."""
     # Unsigned indices spare the look at whether they count from the end.
     low, high = np.uint64(start[group]), np.uint64(start[group + np.uint64(1)] - 1)
