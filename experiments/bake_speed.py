@@ -4,6 +4,9 @@ Question: seconds at equal error, of the relit result and of each map, against M
           the share of Embree's own rate; the bias of the operator; what texels, rays, lightings and triangles cost.
 Command:  python experiments/bake_speed.py --quick            under a minute; last line is JSON
           python experiments/bake_speed.py compare SCENE [full]    the whole comparison, minutes; a line of JSON at its end
+          python experiments/bake_speed.py integrators        error over seconds of all three, and of both peers
+          python experiments/bake_speed.py sampling           what the sequence saves against independent numbers
+          python experiments/bake_speed.py draw               docs/baking.png, from what these left in runs/
           python experiments/bake_speed.py scaling            slopes over texels, rays, lightings and triangles
           python experiments/bake_speed.py bias               operator against reference on every library scene
 Answer:   docs/baking.md
@@ -21,6 +24,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -28,7 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import ddprt
-from ddprt import seeds
+from ddprt import seeds, warp
 from ddprt.config import Config, load_config
 from ddprt.dataset.store import average_into_points
 from ddprt.fitting.encoding import Encoding
@@ -42,11 +46,14 @@ from ddprt.scene.mesh import Scene
 from ddprt.transport.direct import centred, mean_irradiance, on_texels
 from ddprt.transport.effort import choose_rays
 from ddprt.transport.embree import Tracer
-from ddprt.transport.gather import Receivers, seen_from
+from ddprt.transport.footprint import find_footprints
+from ddprt.transport.gather import Pattern, Receivers, seen_from
 from ddprt.transport.measure import measure
 from ddprt.transport.openness import build_open_atlas
 from ddprt.transport.operator import Operator
 from ddprt.transport.paths import trace_paths
+from ddprt.transport.reference import on_texels as on_all_texels
+from ddprt.transport.reference import trace_reference
 
 RESOLUTION = 152  # 15 k texels on the Cornell box
 BASES, POINTS, SUPERSAMPLE = 16, 128, 8
@@ -386,7 +393,135 @@ def compare(name: str = "cornell", extent: str = "brief") -> None:
                 entry["relit"] = relit_faster(ours, run.seconds * count, relit[count])
             table.append({key: float(f"{value:.4g}") for key, value in entry.items()})
             print(f"  times faster at equal error: {table[-1]}", flush=True)
+    keep(name, table)
+
+
+def keep(name: str, table: list[dict[str, Any]]) -> None:
+    """Leaves results for `draw`, and prints them."""
+    path = Path("runs") / f"bake_speed-{name}.json"
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(json.dumps(table) + "\n")
     print(json.dumps(table))
+
+
+def integrators() -> None:
+    """Seconds and error per map of 128 lightings of the Cornell box; slow ones are measured on fewer and multiplied."""
+    count, both = 128, Comparison("cornell", 128, 16, (512, 16384))
+    atlas, table = both.on.atlas, []
+
+    def note(name: str, samples: float, seconds: float, maps: np.ndarray) -> None:
+        error = both.error(maps[: both.tests])
+        table.append({"integrator": name, "samples": samples, "seconds": round(seconds, 3), "error": round(error, 5)})
+        print(table[-1], flush=True)
+
+    for run in both.ours((8, 16, 64, 256, 1024), count, learn=False):
+        note("operator", run.samples, run.seconds, run.maps)
+    for samples in (4, 16, 64, 256):
+        maps = np.zeros((count, atlas.count, 3), np.float32)
+        for measured in (2, count):  # the first compiles
+            start = time.perf_counter()
+            for _ in trace_paths(
+                both.on.tracer,
+                both.on.scene,
+                atlas,
+                both.on.train[:measured],
+                maps[:measured],
+                samples=samples,
+                seed=0,
+                stream="speed",
+            ):
+                pass
+        note("paths", samples, time.perf_counter() - start, maps)
+    few = 4
+    for samples in (16, 64, 256):
+        start = time.perf_counter()
+        texels = on_all_texels(both.on.tracer, atlas, np.arange(atlas.count))
+        maps = np.stack(
+            [
+                trace_reference(both.on.tracer, both.on.scene, lighting, texels, atlas.count, samples, seed=index).indirect
+                for index, lighting in enumerate(both.on.train[:few])
+            ]
+        )
+        note("reference", samples, (time.perf_counter() - start) * count / few, maps)
+    for samples, lightings in ((16, 16), (64, 16), (256, 8), (1024, 2)):
+        run, _ = both.theirs(samples, lightings)
+        note("Mitsuba", samples, run.seconds * count, run.maps)
+    keep("integrators", table)
+
+
+def sampling() -> None:
+    """Noise of independent rays, of Sobol blocks dealt out at random and in Z-order: of a texel and of 5 x 5 means."""
+    on = stage("cornell", RESOLUTION, 8, 1)
+    operator, count = Operator.of(on.tracer, on.atlas), on.atlas.count
+    places = on_texels(on.tracer, on.atlas, 4, seeds.stream(0, "texel positions"))
+    lights = [mean_irradiance(on.tracer, centred(on.tracer, light), places, seeds.stream(0, "d")) for light in on.train]
+    sent = np.concatenate([operator.averaged(light) for light in lights], 1)
+    radiosity = operator.bounce(sent, seed=0, stream="sampling").radiosity
+    wide = find_footprints(on.atlas, np.full(count, 1e-3), 1.0)  # as good as a plain mean over the neighbours
+    dealt = Pattern.of, Pattern.deal
+
+    def independent(samples: int, seed: int) -> Pattern:
+        u = np.random.default_rng(seed).random((samples, 1 << 8, 4), np.float32)
+        return Pattern(np.ascontiguousarray(warp.sample_cosine(u[..., :2])[..., :2]), np.ascontiguousarray(u[..., 2:]))
+
+    def shuffled(self: Pattern, row: np.ndarray, column: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        rng = np.random.default_rng(seed)
+        turn = 2 * np.pi * rng.random(len(row))
+        block = rng.integers(0, self.disk.shape[1], len(row)).astype(np.int32)
+        return block, np.stack([np.cos(turn), np.sin(turn)], 1).astype(np.float32)
+
+    print("rays  numbers      relative RMSE of a texel  of a mean over 5 x 5")
+    for samples in (16, 64, 256):
+        for name, of, deal in (("independent", independent, shuffled), ("Sobol", dealt[0], shuffled), ("Z-order", *dealt)):
+            Pattern.of, Pattern.deal = staticmethod(of), deal  # type: ignore[method-assign]
+            runs = []
+            for run in range(2):
+                maps = np.empty((len(on.train), count, 3), np.float32)
+                list(operator.gather(radiosity, maps, np.full(count, samples), seed=0, stream=f"sampling {run}"))
+                runs.append(maps)
+            noise = runs[0] - runs[1]
+            smooth = np.stack([wide.pooled(values) for values in noise])
+            texel, mean = (np.sqrt(np.mean(values**2) / 2) / runs[0].mean() for values in (noise, smooth))
+            print(f"{samples:4d}  {name:12s} {texel:23.4f} {mean:21.4f}", flush=True)
+    Pattern.of, Pattern.deal = dealt  # type: ignore[method-assign]
+
+
+def draw() -> None:
+    """docs/baking.png: ratios over lightings, and errors over seconds."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    table = json.loads(Path("runs/bake_speed-cornell.json").read_text())
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
+    for paths in sorted({entry["paths"] for entry in table}):
+        rows = [entry for entry in table if entry["paths"] == paths]
+        left.loglog(
+            [row["lightings"] for row in rows], [row["per_map"] for row in rows], "o-", label=f"{paths:.0f} paths, per map"
+        )
+        relit = [row for row in rows if "relit" in row]
+        if relit:
+            left.loglog([row["lightings"] for row in relit], [row["relit"] for row in relit], "kx")
+    left.plot([], [], "kx", label="relit from 16 bases")
+    left.axhline(1, color="grey", linewidth=0.8)
+    left.set(xlabel="lightings", ylabel="times faster than Mitsuba at equal error", title="Cornell box, 15 k texels")
+    left.legend(fontsize=8)
+    rows = json.loads(Path("runs/bake_speed-integrators.json").read_text()) + CYCLES
+    for name in dict.fromkeys(row["integrator"] for row in rows):
+        mine = [row for row in rows if row["integrator"] == name]
+        right.loglog([row["seconds"] for row in mine], [row["error"] for row in mine], "o-", label=name)
+    right.set(xlabel="seconds for 128 lightings, two cores", ylabel="relative RMSE of a map", title="error over seconds")
+    right.legend(fontsize=8)
+    figure.savefig("docs/baking.png", dpi=90)
+
+
+CYCLES = [
+    {"integrator": "Cycles", "samples": 16, "seconds": 128 * 0.216, "error": 0.385},
+    {"integrator": "Cycles", "samples": 64, "seconds": 128 * 0.789, "error": 0.177},
+    {"integrator": "Cycles", "samples": 256, "seconds": 128 * 3.11, "error": 0.0837},
+]
+"""One lighting by datasets/recipes/cycles_bake.py on the same machine, times 128; error from two runs."""
 
 
 # --- what things cost -----------------------------------------------------------------------------------------------------
@@ -436,4 +571,13 @@ def bias() -> None:
 
 if __name__ == "__main__":
     verb, *rest = [word.removeprefix("--") for word in sys.argv[1:]] or ["quick"]
-    {"quick": quick, "compare": compare, "scaling": scaling, "bias": bias}[verb](*rest)
+    verbs: dict[str, Callable[..., None]] = {
+        "quick": quick,
+        "compare": compare,
+        "integrators": integrators,
+        "sampling": sampling,
+        "draw": draw,
+        "scaling": scaling,
+        "bias": bias,
+    }
+    verbs[verb](*rest)

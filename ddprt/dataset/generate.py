@@ -215,8 +215,12 @@ class _Bake:
     def _judge_lightings(self, dataset: Dataset, fresh: bool) -> None:
         """Names lightings that light nothing or stand where no lamp should, and why; refuses a bake of darkness."""
         faults, dark = [], 0
-        for index, lighting in enumerate(dataset.lightings):
-            black = not store.read_map(self.folder / map_name("direct", index)).any()
+
+        def is_black(index: int) -> bool:
+            return not store.read_map(self.folder / map_name("direct", index)).any()
+
+        lit = zip(dataset.lightings, self.tracer.map(is_black, range(len(dataset.lightings))), strict=True)
+        for index, (lighting, black) in enumerate(lit):
             dark += black
             why = doubt(lighting, black, self.scene, self.tracer)
             if why:

@@ -1,6 +1,5 @@
 """How many rays each texel gets: as many as a target for the noise asks, and more where they are needed."""
 
-import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,7 +61,7 @@ def choose_rays(
     halves, samples = (2, config.test_samples) if held_out else (1, config.samples)
     footprint, adaptive = (0.0, False) if held_out else (config.footprint, config.adaptive)
     area = operator.atlas.area
-    each = _seconds_per_ray(operator, radiosity, seed)
+    each = operator.seconds_per_ray(radiosity, _MANY, _TIMED)
     radiosity = _some(radiosity)
     pilot = operator.pilot(radiosity, _PILOT, seed=seed, stream=stream)
     footprints = find_footprints(operator.atlas, pilot.nearness, footprint) if footprint > 0 else None
@@ -126,14 +125,6 @@ def _some(radiosity: Float32[np.ndarray, "senders columns"]) -> Float32[np.ndarr
     lightings = radiosity.shape[1] // 3
     chosen = np.unique(np.linspace(0, lightings - 1, min(lightings, _LIGHTINGS)).astype(int))
     return np.ascontiguousarray(radiosity.reshape(len(radiosity), -1, 3)[:, chosen].reshape(len(radiosity), -1))
-
-
-def _seconds_per_ray(operator: Operator, radiosity: Float32[np.ndarray, "senders columns"], seed: int) -> float:
-    """With all lightings, on all cores."""
-    texels = np.linspace(0, operator.atlas.count - 1, min(operator.atlas.count, _TIMED)).astype(int)
-    begun = time.perf_counter()
-    operator.gather_some(radiosity, texels, _MANY, seed=seed, stream="rate")
-    return (time.perf_counter() - begun) / (_MANY * len(texels))
 
 
 def _smoothed(

@@ -10,6 +10,7 @@ A lighting is a column of these products, so one more costs its shadow rays and 
 only bias; `experiments/bake_speed.py bias` measures it against unbiased paths.
 """
 
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -211,6 +212,15 @@ class Operator:
         table = _with_dark_row(radiosity)
         parts = list(self.tracer.map(lambda tile: self._sums(receivers, tile, table), receivers.tiles()))
         return np.concatenate(parts).reshape(len(texels), -1, 3).swapaxes(0, 1) * np.float32(1 / samples)
+
+    def seconds_per_ray(self, radiosity: Float32[np.ndarray, "senders columns"], samples: int, texels: int) -> float:
+        """How long a ray takes with all these lightings on all cores, by a few texels."""
+        chosen = np.unique(np.linspace(0, self.atlas.count - 1, texels).astype(int))
+        receivers, table = Receivers.texels(self.atlas, samples, 0, "rate", chosen), _with_dark_row(radiosity)
+        begun = time.perf_counter()
+        for _ in self.tracer.map(lambda tile: self._sums(receivers, tile, table), receivers.tiles()):
+            pass
+        return (time.perf_counter() - begun) / (samples * len(chosen))
 
     def _sums(
         self, receivers: Receivers, tile: slice, table: Float32[np.ndarray, "senders_and_dark columns"]
