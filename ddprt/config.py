@@ -215,7 +215,8 @@ def load_config(path: str | Path | None, overrides: dict[str, str] | None = None
             raise UserError(f"{path}: got {error.strerror or error}, expected a readable TOML file") from None
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise UserError(f"{path}: not TOML: {error}") from None
-    for dotted, text in (overrides or {}).items():
+    overrides = {_as_written(dotted): text for dotted, text in (overrides or {}).items()}
+    for dotted, text in overrides.items():
         _check_key(dotted)
         *parents, leaf = dotted.split(".")
         table = document
@@ -227,7 +228,7 @@ def load_config(path: str | Path | None, overrides: dict[str, str] | None = None
     try:
         return Config.model_validate(document)
     except ValidationError as error:
-        raise UserError(explain(error, path, overrides or {})) from None
+        raise UserError(explain(error, path, overrides)) from None
 
 
 def keys(model: type[BaseModel] = Config, prefix: str = "") -> list[str]:
@@ -270,6 +271,12 @@ def _choice_hint(fault: Any) -> str:
     if fault["type"] != "literal_error" or not isinstance(fault["input"], str):
         return ""
     return nearest(fault["input"], fault["ctx"]["expected"].replace("'", "").replace(" or ", ", ").split(", "))
+
+
+def _as_written(dotted: str) -> str:
+    """The key as the file spells it: the help prints hyphens, as command lines do."""
+    plain = dotted.replace("-", "_")
+    return plain if plain in keys() else dotted
 
 
 def _check_key(dotted: str) -> None:

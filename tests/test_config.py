@@ -100,3 +100,11 @@ def test_every_setting_is_described() -> None:
         for parent in parents:
             model = model.model_fields[parent].annotation
         assert model.model_fields[leaf].description, key
+
+
+def test_keys_may_be_spelt_as_the_help_prints_them() -> None:
+    config = load_config(None, {"transport.target-noise": "0.5", "methods.settings.svd-ridge.bases": "4"})
+    assert config.transport.target_noise == 0.5
+    assert config.methods.settings == {"svd-ridge": {"bases": 4}}
+    with pytest.raises(UserError, match=r"^--transport\.target_noise: got 'much'"):
+        load_config(None, {"transport.target-noise": "much"})

@@ -314,3 +314,14 @@ def test_reference_integrator_bakes_the_same_light(cornell: Scene) -> None:
     weight = by_paths.area / by_paths.area.sum()
     one, two = (np.einsum("ltc,t->lc", d.maps("indirect", range(4)), weight) for d in (by_paths, by_operator))
     np.testing.assert_allclose(one, two, rtol=0.05)
+
+
+def test_a_noise_out_of_reach_is_said(cornell: Scene, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    from ddprt.transport import effort
+
+    monkeypatch.setattr(effort, "_MOST", 32)
+    config = small(transport={"samples": "auto", "target_noise": 0.001})
+    bake(cornell, config=config, progress=Progress())
+    words = capsys.readouterr().err
+    assert "warning: transport.target_noise: got 0.001, but the most rays that are traced unasked leave 0." in words
+    assert "transport.test_samples" not in words

@@ -74,6 +74,12 @@ class IndirectBake:
                 chosen = choose_rays(operator, bounced.radiosity, config, held_out=test, seed=self.config.seed, stream=stream)
                 rays, footprints = chosen.rays, chosen.footprints
                 stage.facts |= chosen.facts | self._facts(bounced, operator)
+                given, expected = config.test_samples if test else config.samples, chosen.facts["noise_expected"]
+                if given == "auto" and expected > 1.5 * config.target_noise:
+                    self.progress.say(
+                        f"warning: transport.target_noise: got {config.target_noise:g}, but the most rays that are traced "
+                        f"unasked leave {expected:.2g}; raise it, or set transport.{'test_' if test else ''}samples"
+                    )
             scratch = Scratch(
                 self.dataset.folder / f"{split}-{half}.part",
                 (len(indices), self.atlas.count, 3),
