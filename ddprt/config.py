@@ -98,7 +98,8 @@ class TransportConfig(Section):
     """How light is simulated."""
 
     integrator: Literal["auto", "operator", "paths", "reference"] = Field(
-        "auto", description="auto takes the cheapest that is valid; reference is unbiased path tracing per lighting"
+        "auto",
+        description="auto is the operator; paths is unbiased and shared by all lightings; reference traces each lighting alone",
     )
     samples: Literal["auto"] | Annotated[int, Field(ge=1, le=65536)] = Field(
         "auto", description="mean gather rays per texel for train and validation; auto: as target_noise asks"

@@ -4,6 +4,7 @@ Question: seconds at equal error, of the relit result and of each map, against M
           the share of Embree's own rate; the bias of the operator; what texels, rays, lightings and triangles cost.
 Command:  python experiments/bake_speed.py --quick            under a minute; last line is JSON
           python experiments/bake_speed.py compare SCENE [full]    the whole comparison, minutes; a line of JSON at its end
+          python experiments/bake_speed.py rate [SCENE]       the share of Embree's rate
           python experiments/bake_speed.py integrators        error over seconds of all three, and of both peers
           python experiments/bake_speed.py sampling           what the sequence saves against independent numbers
           python experiments/bake_speed.py draw               docs/baking.png, from what these left in runs/
@@ -229,6 +230,11 @@ def share_of_embree(on: Stage, rounds: int = 5) -> dict[str, float]:
             ratios.append(seconds[1] / seconds[0])
         shares[name] = float(np.median(ratios))
     return shares
+
+
+def rate(name: str = "cornell") -> None:
+    """The share of Embree's rate, with point lamps."""
+    print(name, share_of_embree(stage(name, RESOLUTION, 32, 1), 9))
 
 
 def _recorded(tracer: Tracer, query: str, work: Callable[[Any], None], items: list[Any]) -> list[tuple[np.ndarray, ...]]:
@@ -575,6 +581,7 @@ if __name__ == "__main__":
         "quick": quick,
         "compare": compare,
         "integrators": integrators,
+        "rate": rate,
         "sampling": sampling,
         "draw": draw,
         "scaling": scaling,

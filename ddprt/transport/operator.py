@@ -98,10 +98,9 @@ class Operator:
         """Sparse matrix from texels to senders: the mean by area."""
         from scipy.sparse import csr_array
 
-        texel = np.flatnonzero(self.senders.of_texel >= 0)
-        sender = self.senders.of_texel[texel]
-        share = (self.atlas.area[texel] / self.senders.area[sender]).astype(np.float32)
-        return csr_array((share, (sender, texel)), shape=(self.senders.count, self.atlas.count))
+        sender = self.senders.of_texel
+        share = (self.atlas.area / self.senders.area[sender]).astype(np.float32)
+        return csr_array((share, (sender, np.arange(self.atlas.count))), shape=(self.senders.count, self.atlas.count))
 
     def averaged(self, irradiance: Float32[np.ndarray, "texels 3"]) -> Float32[np.ndarray, "senders 3"]:
         """Mean irradiance of each sender."""
@@ -138,15 +137,14 @@ class Operator:
         self, radiosity: Float32[np.ndarray, "senders columns"], seed: int, stream: str
     ) -> tuple[Any, Float32[np.ndarray, "coarse columns"]]:
         """G among the coarse blocks (sparse where charts are too many), and what they gather from the senders."""
-        coarse = self.coarse
         from scipy.sparse import csr_array, vstack
 
+        coarse = self.coarse
         sparse = coarse.count > 4 * _COARSE
         place = np.arange(coarse.count), coarse.row, coarse.column
         receivers = Receivers.of(coarse.sampler, *place, _COARSE_SAMPLES, seed, f"{stream} senders")
         home = np.zeros(self.senders.count, np.int32)
-        kept = self.senders.of_texel >= 0
-        home[self.senders.of_texel[kept]] = coarse.of_texel[kept]
+        home[self.senders.of_texel] = coarse.of_texel
         table = _with_dark_row(radiosity)
 
         def work(tile: slice) -> tuple[Any, np.ndarray]:
