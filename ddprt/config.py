@@ -99,7 +99,7 @@ class TransportConfig(Section):
 
     integrator: Literal["auto", "operator", "paths", "reference"] = Field(
         "auto",
-        description="auto is the operator; paths is unbiased and shared by all lightings; reference traces each lighting alone",
+        description="auto: the operator; paths: unbiased, shared by all lightings; reference: each lighting alone",
     )
     samples: Literal["auto"] | Annotated[int, Field(ge=1, le=65536)] = Field(
         "auto", description="mean gather rays per texel for train and validation; auto: as target_noise asks"

@@ -1,6 +1,6 @@
 """Indirect lightmaps of a dataset: by the operator or by shared paths for all lightings at once, or one by one."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -80,26 +80,25 @@ class IndirectBake:
                         f"warning: transport.target_noise: got {config.target_noise:g}, but the most rays that are traced "
                         f"unasked leave {expected:.2g}; raise it, or set transport.{'test_' if test else ''}samples"
                     )
-            scratch = Scratch(
-                self.dataset.folder / f"{split}-{half}.part",
-                (len(indices), self.atlas.count, 3),
-                {"dataset": self.dataset.description, "rays": seeds.digest(rays), "half": half},
-            )
-            tiles = operator.gather(
-                bounced.radiosity, scratch.maps, rays, seed=self.config.seed, stream=stream, skip=scratch.done
-            )
-            for texels in tiles:
-                scratch.advance()
-                stage.advance(texels)
-            scratch.note()
+            scratch = self._scratch(split, half, indices, rays=seeds.digest(rays))
+            address: dict[str, Any] = {"seed": self.config.seed, "stream": stream}
+            scratch.follow(operator.gather(bounced.radiosity, scratch.maps, rays, skip=scratch.done, **address), stage.advance)
             parts.append(scratch)
+        self._finish(parts, indices, todo, kinds, footprints.pooled if footprints else lambda light: light)
+
+    def _scratch(self, split: str, half: int, indices: list[int], **rays: int) -> Scratch:
+        """Where a half of a split's maps is made."""
+        key = {"dataset": self.dataset.description, "half": half, **rays}
+        return Scratch(self.dataset.folder / f"{split}-{half}.part", (len(indices), self.atlas.count, 3), key)
+
+    def _finish(
+        self, parts: list[Scratch], indices: list[int], todo: list[int], kinds: list[str], last: Callable[[Any], Any]
+    ) -> None:
+        """Writes the maps: the mean of two halves and half their difference, or what `last` makes of the only part."""
 
         def finished(index: int) -> list[np.ndarray]:
-            row = indices.index(index)
-            if test:
-                first, second = (part.maps[row] for part in parts)
-                return [(first + second) / 2, (first - second) / 2]
-            return [footprints.pooled(parts[0].maps[row]) if footprints else parts[0].maps[row]]
+            halves = [part.maps[indices.index(index)] for part in parts]
+            return [last(halves[0])] if len(halves) == 1 else [(halves[0] + halves[1]) / 2, (halves[0] - halves[1]) / 2]
 
         self._write(todo, finished, kinds)
         for part in parts:
@@ -144,26 +143,11 @@ class IndirectBake:
         stage.facts["samples"] = samples * halves
         parts = []
         for half in range(halves):
-            scratch = Scratch(
-                self.dataset.folder / f"{split}-{half}.part",
-                (len(indices), self.atlas.count, 3),
-                {"dataset": self.dataset.description, "paths": samples, "half": half},
-            )
-            for texels in trace_paths(
-                *scene, scratch.maps, samples=samples, stream=f"{stream} {half}", skip=scratch.done, **shared
-            ):
-                scratch.advance()
-                stage.advance(texels)
-            scratch.note()
+            scratch = self._scratch(split, half, indices, paths=samples)
+            address: dict[str, Any] = {"samples": samples, "stream": f"{stream} {half}", **shared}
+            scratch.follow(trace_paths(*scene, scratch.maps, skip=scratch.done, **address), stage.advance)
             parts.append(scratch)
-
-        def finished(index: int) -> list[np.ndarray]:
-            first, last = (part.maps[indices.index(index)] for part in (parts[0], parts[-1]))
-            return [(first + last) / 2, (first - last) / 2]
-
-        self._write(todo, finished, kinds)
-        for part in parts:
-            part.remove()
+        self._finish(parts, indices, todo, kinds, lambda light: light)
 
     def _by_reference(self, split: str, todo: list[int], kinds: list[str], stage: Stage) -> None:
         from ddprt.transport.reference import on_texels, trace_reference

@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +50,13 @@ class Scratch:
         except OSError as error:
             raise UserError(f"{path}: cannot be written ({error.strerror or error}); free some space") from None
         self._open = self.done
+
+    def follow(self, tiles: Iterator[int], told: Callable[[int], None]) -> None:
+        """Counts tiles as they are finished, and tells their texels."""
+        for texels in tiles:
+            self.advance()
+            told(texels)
+        self.note()
 
     def advance(self) -> None:
         """Counts one more tile; now and then makes sure that it is on disk."""
