@@ -87,7 +87,8 @@ def _gathering(config: Config, tracer: Any, atlas: Any, lightings: Any) -> list[
     for name, held_out in (("training", False), ("held-out", True)):
         address: dict[str, Any] = {"seed": config.seed, "stream": f"inspect {name}"}
         radiosity = operator.bounce(averaged, bounces=config.transport.bounces, **address).radiosity
-        facts = choose_rays(operator, radiosity, config.transport, held_out=held_out, **address).facts
+        near = operator.near(lightings, averaged, bounces=config.transport.bounces)
+        facts = choose_rays(operator, radiosity, config.transport, near=near, held_out=held_out, **address).facts
         rays, noise = facts["samples"], 100 * facts["noise_expected"]
         total = rays * atlas.count / 1e6
         lines.append(f"            {name} maps: {rays:g} gather rays per texel ({total:.0f} M), noise about {noise:.2g} %")

@@ -93,18 +93,20 @@ def bake(
     tracer, atlas = on.tracer, on.atlas
     transport = on.config.transport.model_copy(update={"samples": samples})
     start = time.perf_counter()
-    places = on_texels(tracer, atlas, transport.direct_samples, seeds.stream(0, "texel positions"))
+    address = stream.encode()
+    places = on_texels(tracer, atlas, transport.direct_samples, seeds.stream(0, "texel positions", *address))
     operator = Operator.of(tracer, atlas, transport.sender_resolution)
 
     def direct(index: int) -> np.ndarray:
-        light = mean_irradiance(tracer, centred(tracer, lightings[index]), places, seeds.stream(0, "direct", index))
+        light = mean_irradiance(tracer, centred(tracer, lightings[index]), places, seeds.stream(0, "direct", index, *address))
         return operator.averaged(light)
 
     sent = np.concatenate(list(tracer.map(direct, range(len(lightings)))), 1)
+    near = operator.near(lightings, sent)
     bounced = operator.bounce(sent, seed=0, stream=stream)
-    chosen = choose_rays(operator, bounced.radiosity, transport, held_out=False, seed=0, stream=stream)
+    chosen = choose_rays(operator, bounced.radiosity, transport, near=near, held_out=False, seed=0, stream=stream)
     maps = np.empty((len(lightings), atlas.count, 3), np.float32)
-    for _ in operator.gather(bounced.radiosity, maps, chosen.rays, seed=0, stream=stream):
+    for _ in operator.gather(bounced.radiosity, maps, chosen.rays, near=near, seed=0, stream=stream):
         pass
     if chosen.footprints:
         for index, pooled in enumerate(tracer.map(lambda index: chosen.footprints.pooled(maps[index]), range(len(lightings)))):

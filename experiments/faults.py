@@ -71,7 +71,9 @@ def bake(tracer: Tracer, atlas: Atlas, scene: Scene) -> tuple[np.ndarray, np.nda
     direct = trace_reference(tracer, scene, LAMP, start, atlas.count, PATHS, seed=0, bounces=0).direct
     senders = atlas.senders(max(1, atlas.resolution // SENDERS))
     landing, receivers = Landing.of(atlas, senders.of_texel), Receivers.texels(atlas, RAYS, 0, "faults")
-    cells = [np.concatenate([c for c, _ in seen_from(tracer, receivers, tile, landing)]).T for tile in receivers.tiles()]
+    cells = [
+        np.concatenate([seen.cells for seen in seen_from(tracer, receivers, tile, landing)]).T for tile in receivers.tiles()
+    ]
     share = atlas.area / senders.area[senders.of_texel]
     indirect = np.zeros_like(direct)
     for _ in range(BOUNCES):

@@ -173,8 +173,8 @@ def test_the_mean_over_seeds_is_the_truth(plates: Scene, samples: int, seeds: in
     found = np.zeros((seeds, len(chosen)))
     for seed in range(seeds):
         receivers = Receivers.texels(atlas, samples, seed, "unbiased", chosen)
-        for cells, _ in seen_from(tracer, receivers, slice(0, len(chosen)), landing):
-            found[seed] += (cells == 0).sum(0) / samples
+        for seen in seen_from(tracer, receivers, slice(0, len(chosen)), landing):
+            found[seed] += (seen.cells == 0).sum(0) / samples
     error = found.std(0, ddof=1) / np.sqrt(seeds)
     assert (error < 0.15 * np.array(truth)).all()
     assert (np.abs(found.mean(0) - truth) < 4 * error + 1e-4).all()  # the quadrature: 36 places per triangle of a texel
@@ -224,8 +224,7 @@ def agree(
 ) -> set[int]:
     """Compares chosen (sample, receiver of the tile) pairs with the slow twin; gives the kinds of cells that there were."""
     chunks = list(seen_from(tracer, receivers, tile, Landing.of(atlas, of_texel)))
-    assert all(cells.shape == distance.shape for cells, distance in chunks)
-    cells, distance = (np.concatenate(part) for part in zip(*chunks, strict=True))
+    cells, distance = (np.concatenate([getattr(seen, name) for seen in chunks]) for name in ("cells", "distance"))
     assert cells.shape == (receivers.samples, tile.stop - tile.start)
     kinds, wrong, unclear = set(), 0, 0
     for sample, receiver in pairs:
@@ -310,7 +309,9 @@ def everything(receivers: Receivers, look: Callable[[slice], Any]) -> tuple[np.n
     """Cells and distances of all receivers, tile by tile."""
     columns = []
     for tile in receivers.tiles():
-        columns.append([np.concatenate(part) for part in zip(*look(tile), strict=True)])
+        columns.append(
+            [np.concatenate(part) for part in zip(*((seen.cells, seen.distance) for seen in look(tile)), strict=True)]
+        )
     return tuple(np.concatenate(part, 1) for part in zip(*columns, strict=True))  # type: ignore[return-value]
 
 
@@ -329,7 +330,7 @@ def test_cells_do_not_depend_on_tiles_and_chunks(
         monkeypatch.setattr(gather, "_CALL", call)
         tiles = list(receivers.tiles())
         assert [tile.start for tile in tiles] + [receivers.count] == [0] + [tile.stop for tile in tiles]
-        assert all(len(cells) * (tiles[0].stop - tiles[0].start) <= max(call, tiles[0].stop) for cells, _ in look(tiles[0]))
+        assert all(seen.cells.size <= max(call, tiles[0].stop) for seen in look(tiles[0]))
         before = tracer.rays
         for mine, other in zip(everything(receivers, look), usual, strict=True):
             np.testing.assert_array_equal(mine, other)

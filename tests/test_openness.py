@@ -36,7 +36,7 @@ def landed(scene: Scene, atlas: Atlas, samples: int = 64) -> np.ndarray:
     """Texels that rays from every texel land on, one row each."""
     landing = Landing.of(atlas, np.arange(atlas.count, dtype=np.int32))
     receivers, tracer = Receivers.texels(atlas, samples, 0, "test"), Tracer.of(scene)
-    tiles = (np.concatenate([cells for cells, _ in seen_from(tracer, receivers, tile, landing)]) for tile in receivers.tiles())
+    tiles = (np.concatenate([seen.cells for seen in seen_from(tracer, receivers, tile, landing)]) for tile in receivers.tiles())
     return np.concatenate([cells.T for cells in tiles])
 
 

@@ -155,9 +155,9 @@ def slow_series(made: Made, monkeypatch: pytest.MonkeyPatch) -> tuple[np.ndarray
     ready, seen = made.operator, {}
 
     def watched(tracer: Tracer, receivers: Receivers, tile: slice, landing: Any) -> Iterator[Any]:
-        for cells, distance in seen_from(tracer, receivers, tile, landing):
-            seen.setdefault(tile.start, []).append(cells.copy())
-            yield cells, distance
+        for rays in seen_from(tracer, receivers, tile, landing):
+            seen.setdefault(tile.start, []).append(rays.cells.copy())
+            yield rays
 
     with monkeypatch.context() as patch:
         patch.setattr(operator, "seen_from", watched)
@@ -304,7 +304,7 @@ def test_gather_agrees_with_loops(small: Made) -> None:
     found = ready.gather_some(radiosity, np.arange(small.atlas.count), 9, seed=1, stream="loops")
     receivers = Receivers.texels(small.atlas, 9, 1, "loops", np.arange(small.atlas.count))
     for tile in itertools.islice(receivers.tiles(), 2):
-        cells = np.concatenate([cells for cells, _ in seen_from(ready.tracer, receivers, tile, ready.landing)])
+        cells = np.concatenate([seen.cells for seen in seen_from(ready.tracer, receivers, tile, ready.landing)])
         for receiver in range(0, tile.stop - tile.start, 5):
             for lighting in range(2):
                 for channel in range(3):
@@ -325,7 +325,10 @@ def test_averages_agree_with_loops(coarsely: Made) -> None:
 
 
 @pytest.mark.parametrize("skip", [0, 4, 1000])
-def test_skipped_tiles_are_left_alone_and_the_rest_has_the_same_bits(box: Made, light: np.ndarray, skip: int) -> None:
+def test_skipped_tiles_are_left_alone_and_the_rest_has_the_same_bits(
+    box: Made, light: np.ndarray, skip: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(operator, "_TOGETHER", 1)
     rays, tracer = uneven(box.atlas), box.operator.tracer
     whole, rest = np.full((2, 3, box.atlas.count, 3), np.nan, np.float32)
     before = tracer.rays
@@ -363,8 +366,8 @@ def test_a_pilot_agrees_with_loops(small: Made) -> None:
     pilot = ready.pilot(radiosity, 12, seed=3, stream="look")
     receivers = Receivers.texels(small.atlas, 12, 3, "look pilot")
     tile = next(receivers.tiles())
-    chunks = zip(*seen_from(ready.tracer, receivers, tile, ready.landing), strict=True)
-    cells, distance = (np.concatenate(part) for part in chunks)
+    chunks = list(seen_from(ready.tracer, receivers, tile, ready.landing))
+    cells, distance = (np.concatenate([getattr(seen, name) for seen in chunks]) for name in ("cells", "distance"))
     for receiver in range(0, tile.stop, 40):
         near, rows = 0.0, []
         for sample in range(12):
@@ -439,9 +442,10 @@ def slow_footprint(atlas: Atlas, nearness: np.ndarray, share: float, texel: int)
                 continue
             if other != texel and (share == 0 or atlas.geometric_normal[other] @ atlas.geometric_normal[texel] <= 0.9):
                 continue
-            deviation = share / max(nearness[other], nearness[texel], 1e-300)
             away = np.linalg.norm(atlas.position[other] - atlas.position[texel]) if other != texel else 0.0
-            taps[int(other)] = (x, y, atlas.area[other] * np.exp(-0.5 * (away / deviation) ** 2 if away else 0.0))
+            turned = 1 - atlas.geometric_normal[other] @ atlas.geometric_normal[texel] if other != texel else 0.0
+            error = (away * max(nearness[other], nearness[texel])) ** 2 + turned
+            taps[int(other)] = (x, y, atlas.area[other] * np.exp(-0.5 * error / share**2 if error else 0.0))
     place, mass = np.array([tap[:2] for tap in taps.values()], float), np.array([tap[2] for tap in taps.values()])
     spread = (mass[:, None, None] * place[:, :, None] * place[:, None, :]).sum(0) + 1e-3 * mass.sum() * np.eye(2)
     tilt = np.linalg.solve(spread, mass @ place)

@@ -6,7 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from ddprt.dataset.store import open_dataset
 from ddprt.errors import UserError
 from ddprt.progress import Progress
 from ddprt.scene.mesh import Scene
+from ddprt.transport import operator
 from ddprt.transport.operator import Operator
 
 SHAPE, KEY = (2, 5, 3), {"seed": 1, "rays": 7}
@@ -271,15 +272,21 @@ def rays_of(
     folder: Path, cornell: Scene, monkeypatch: pytest.MonkeyPatch, tiles: list[list[int]] | None = None, **settings: Any
 ) -> list[int]:
     """Bakes, and counts the rays that each gather traces; those of each of its tiles, traced or not, go into `tiles`."""
-    counts, gather = [], Operator.gather
+    counts, gather, seen_from = [], Operator.gather, operator.seen_from
+    traced: list[int] = []  # rays that leave texels; what near ones go on to is not counted
+
+    def noted(*given: Any) -> Any:
+        for seen in seen_from(*given):
+            traced.append(seen.cells.size)
+            yield seen
 
     def counted(self: Operator, radiosity: np.ndarray, out: np.ndarray, rays: np.ndarray, **where: Any) -> Any:
         if not isinstance(out, np.memmap):
             yield from gather(self, radiosity, out, rays, **where)  # a probe
             return
-        before = self.tracer.rays
+        before = sum(traced)
         yield from gather(self, radiosity, out, rays, **where)
-        counts.append(self.tracer.rays - before)
+        counts.append(sum(traced) - before)
         if tiles is not None:
             tiles.append([])
             for samples in np.unique(rays):
@@ -287,9 +294,18 @@ def rays_of(
                 tiles[-1] += [int(samples) * min(size, texels - first) for first in range(0, texels, size)]
 
     with monkeypatch.context() as patch:
+        patch.setattr(operator, "seen_from", noted)
         patch.setattr(Operator, "gather", counted)
         bake(cornell, config=CONFIG, out=folder, **settings)
     return counts
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _single_tiles() -> Iterator[None]:
+    """Stretches of one tile, so that even these small maps have many."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(operator, "_TOGETHER", 1)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -354,12 +370,13 @@ from ddprt.dataset import scratch
 from ddprt.dataset.generate import bake
 from ddprt.dataset.scratch import Scratch
 from ddprt.scene.library import build
+from ddprt.transport import operator
 advance = Scratch.advance
 def killed(self):
     advance(self)
     if self.path.name == "train-0.part" and self.done == 5:
         os.kill(os.getpid(), signal.SIGKILL)
-Scratch.advance, scratch._EVERY = killed, -1
+Scratch.advance, scratch._EVERY, operator._TOGETHER = killed, -1, 1
 bake(build("cornell"), config=load_config(sys.argv[1]), out=sys.argv[2])
 """
 

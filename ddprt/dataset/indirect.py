@@ -15,6 +15,7 @@ from ddprt.dataset.store import Dataset, Manifest, map_name, read_map, write_map
 from ddprt.progress import Progress, Stage
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
+from ddprt.transport.direct import centred, mean_irradiance, on_texels
 from ddprt.transport.effects import Plan
 from ddprt.transport.embree import Tracer
 
@@ -65,13 +66,16 @@ class IndirectBake:
 
         config, test = self.config.transport, split == "test"
         operator = Operator.of(self.tracer, self.atlas, config.sender_resolution)
-        direct = self._averaged(operator, indices)
+        lightings = [self.dataset.lightings[index] for index in indices]
         parts, rays, footprints = [], None, None
         for half in range(len(kinds)):
             stream = f"{split} {half}"
+            direct = self._averaged(operator, indices, half)
             bounced = operator.bounce(direct, seed=self.config.seed, stream=stream, bounces=self.effects.bounces)
+            near = operator.near(lightings, direct, bounces=self.effects.bounces)
+            address: dict[str, Any] = {"seed": self.config.seed, "stream": stream, "near": near}
             if rays is None:
-                chosen = choose_rays(operator, bounced.radiosity, config, held_out=test, seed=self.config.seed, stream=stream)
+                chosen = choose_rays(operator, bounced.radiosity, config, held_out=test, **address)
                 rays, footprints = chosen.rays, chosen.footprints
                 stage.facts |= chosen.facts | self._facts(bounced, operator)
                 given, expected = config.test_samples if test else config.samples, chosen.facts["noise_expected"]
@@ -81,7 +85,6 @@ class IndirectBake:
                         f"unasked leave {expected:.2g}; raise it, or set transport.{'test_' if test else ''}samples"
                     )
             scratch = self._scratch(split, half, indices, rays=seeds.digest(rays))
-            address: dict[str, Any] = {"seed": self.config.seed, "stream": stream}
             scratch.follow(operator.gather(bounced.radiosity, scratch.maps, rays, skip=scratch.done, **address), stage.advance)
             parts.append(scratch)
         self._finish(parts, indices, todo, kinds, footprints.pooled if footprints else lambda light: light)
@@ -114,12 +117,16 @@ class IndirectBake:
             )
         return {"bounces": bounced.bounces, "senders": operator.senders.count, "remainder": remainder}
 
-    def _averaged(self, operator: Any, indices: Sequence[int]) -> Float32[np.ndarray, "senders columns"]:
-        """Direct light of all lightings on the senders, a map at a time."""
-        covered = self.dataset.covered
+    def _averaged(self, operator: Any, indices: Sequence[int], half: int) -> Float32[np.ndarray, "senders columns"]:
+        """Direct light of all lightings on the senders: as it was baked, or a second time for an independent half."""
+        covered, seed, samples = self.dataset.covered, self.config.seed, self.config.transport.direct_samples
+        places = on_texels(self.tracer, self.atlas, samples, seeds.stream(seed, "texel positions", half)) if half else None
 
         def work(index: int) -> np.ndarray:
-            return operator.averaged(read_map(self.dataset.folder / map_name("direct", index))[covered])
+            if places is None:
+                return operator.averaged(read_map(self.dataset.folder / map_name("direct", index))[covered])
+            lights = centred(self.tracer, self.dataset.lightings[index])
+            return operator.averaged(mean_irradiance(self.tracer, lights, places, seeds.stream(seed, "direct", index, half)))
 
         return np.concatenate(list(self.tracer.map(work, indices)), 1)
 

@@ -9,6 +9,7 @@ from ddprt import seeds
 from ddprt.axes import Float32, Float64, Int
 from ddprt.config import TransportConfig
 from ddprt.transport.footprint import Footprints, find_footprints
+from ddprt.transport.near import NearField, columns_of
 from ddprt.transport.operator import Operator
 
 _PILOT = 8  # rays of every texel that tell distances and variances, and are thrown away
@@ -42,6 +43,7 @@ def choose_rays(
     radiosity: Float32[np.ndarray, "senders columns"],
     config: TransportConfig,
     *,
+    near: NearField | None = None,
     held_out: bool,
     seed: int,
     stream: str,
@@ -53,6 +55,7 @@ def choose_rays(
     Args:
       operator, radiosity: what will be gathered.
       config: samples or the noise to aim at, footprint, adaptive.
+      near: the light of near senders, for as many lightings.
       held_out: for scores rather than for training.
       seed, stream: address of the random numbers; independent of those that gather.
     Returns:
@@ -62,12 +65,14 @@ def choose_rays(
     footprint, adaptive = (0.0, False) if held_out else (config.footprint, config.adaptive)
     area = operator.atlas.area
     each = operator.seconds_per_ray(radiosity, _MANY, _TIMED)
-    radiosity = _some(radiosity)
+    lightings = radiosity.shape[1] // 3
+    chosen = np.unique(np.linspace(0, lightings - 1, min(lightings, _LIGHTINGS)).astype(int))  # enough to tell what is needed
+    radiosity, near = columns_of(radiosity, chosen), near.some(chosen) if near else None
     pilot = operator.pilot(radiosity, _PILOT, seed=seed, stream=stream)
     footprints = find_footprints(operator.atlas, pilot.nearness, footprint) if footprint > 0 else None
     burden = footprints.burden(area) if footprints else area
     variance = _smoothed(operator, pilot.nearness, pilot.variance, _WIDE)
-    few, power, texels, error = _measure_noise(operator, radiosity, burden, variance, seed, stream)
+    few, power, texels, error = _measure_noise(operator, radiosity, near, burden, variance, seed, stream)
     ratio, share = allot(variance, burden, power) if adaptive else (1.0, np.ones(len(area)))
     if ratio < 1 and error.any():  # the pilot chose, so only the probes can tell what that is worth
         ratio = float(error @ share[texels] ** -power / error.sum())
@@ -120,13 +125,6 @@ def _rounded(share: Float64[np.ndarray, " texels"]) -> Float64[np.ndarray, " tex
     return _LEVELS[np.clip(step, 0, len(_LEVELS) - 1).astype(int)]
 
 
-def _some(radiosity: Float32[np.ndarray, "senders columns"]) -> Float32[np.ndarray, "senders chosen"]:
-    """The columns of a few lightings, evenly taken: enough to tell what rays are needed."""
-    lightings = radiosity.shape[1] // 3
-    chosen = np.unique(np.linspace(0, lightings - 1, min(lightings, _LIGHTINGS)).astype(int))
-    return np.ascontiguousarray(radiosity.reshape(len(radiosity), -1, 3)[:, chosen].reshape(len(radiosity), -1))
-
-
 def _smoothed(
     operator: Operator, nearness: Float64[np.ndarray, " texels"], variance: Float64[np.ndarray, " texels"], share: float
 ) -> Float64[np.ndarray, " texels"]:
@@ -138,6 +136,7 @@ def _smoothed(
 def _measure_noise(
     operator: Operator,
     radiosity: Float32[np.ndarray, "senders columns"],
+    near: NearField | None,
     burden: Float64[np.ndarray, " texels"],
     variance: Float64[np.ndarray, " texels"],
     seed: int,
@@ -157,7 +156,9 @@ def _measure_noise(
     runs = {}
     for rays in (_FEW, _MANY):
         for run in range(2):
-            runs[rays, run] = operator.gather_some(radiosity, texels, rays, seed=seed, stream=f"{stream} probe {run}")
+            runs[rays, run] = operator.gather_some(
+                radiosity, texels, rays, seed=seed, stream=f"{stream} probe {run}", near=near
+            )
     mean = float((weight * area[texels]) @ np.mean(list(runs.values()), axis=0).sum((0, 2))) / (3 * lightings * area.sum())
     if mean == 0:
         return 0.0, 1.0, texels, np.zeros(len(texels))

@@ -1,7 +1,8 @@
 """How far a texel may borrow light from its neighbours: indirect light is smooth where nothing is near.
 
-Ward's harmonic mean of the distances that a texel sees bounds how fast irradiance changes there. So texels of one chart that
-face the same way share their rays within a small fraction of that distance; in corners and under edges it shrinks to nothing.
+Ward's harmonic mean of the distances that a texel sees bounds how fast irradiance changes there with place, and the turn of
+the normal how fast it changes on a curved surface. So texels of one chart share their rays within a small fraction of that
+distance and a small turn; in corners and under edges it shrinks to nothing.
 The weights reproduce linear functions, so that slopes and the rims of charts are kept. It is a linear operation, the same for
 every lighting.
 
@@ -53,7 +54,8 @@ def find_footprints(atlas: Atlas, nearness: Float[np.ndarray, " texels"], share:
     Args:
       atlas: the texels.
       nearness: mean of 1 / distance over each texel's cosine-weighted rays, 1/m; infinitely far counts 0.
-      share: standard deviation of a footprint as a share of 1 / nearness; 0 borrows nothing.
+      share: standard deviation of a footprint as a share of 1 / nearness; 0 borrows nothing. A turn of the normal by an angle t
+        counts as sqrt(1 - cos t) of it.
     """
     slot = np.pad(atlas.slot, _REACH, constant_values=-1)
     row, column = np.divmod(atlas.texel, atlas.resolution)
@@ -102,11 +104,11 @@ def _weigh(
             for axis in range(3):
                 away += (place[other, axis] - place[texel, axis]) ** 2
                 facing += normal[other, axis] * normal[texel, axis]
-            near = max(nearness[other], nearness[texel]) / share if share > 0 else np.inf
+            near = max(nearness[other], nearness[texel])
             if other == texel:
                 own[tap] = area[other]
-            elif facing > 0.9 and near < np.inf:
-                own[tap] = area[other] * np.exp(-0.5 * away * near * near)
+            elif share > 0 and facing > 0.9:  # Ward's estimate of the error, in units of what is allowed; squares added
+                own[tap] = area[other] * np.exp(-0.5 * (away * near * near + max(1 - facing, 0)) / share**2)
             mass += own[tap]
             mx += own[tap] * x
             my += own[tap] * y

@@ -133,10 +133,11 @@ class Receivers:
         """Rays of each."""
         return len(self.pattern.disk)
 
-    def tiles(self) -> Iterator[slice]:
-        """Neighbours whose rays are traced together."""
-        size = max(TILE, _CALL // self.samples)
-        return (slice(first, min(first + size, self.count)) for first in range(0, self.count, size))
+    def tiles(self, together: int = 1, within: slice | None = None) -> Iterator[slice]:
+        """Neighbours whose rays are traced together, or so many such tiles at once; of all receivers or within some."""
+        size = together * max(TILE, _CALL // self.samples)
+        start, stop = (0, self.count) if within is None else (within.start, within.stop)
+        return (slice(first, min(first + size, stop)) for first in range(start, stop, size))
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,13 +165,25 @@ class Landing:
         return cls(chart.astype(np.float32), cell, part)
 
 
-def seen_from(
-    tracer: Tracer, receivers: Receivers, tile: slice, landing: Landing
-) -> Iterator[tuple[Int32[np.ndarray, "samples tile"], Float32[np.ndarray, "samples tile"]]]:
-    """What a tile of receivers sees, some samples at a time: the cell that each ray meets, and how far away.
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What some rays of a tile met.
 
-    Negative cells: `NOTHING` where a ray escapes or lands outside all cells, `BACK` where it meets the back of a surface.
+    Attributes:
+      cells: where each landed: `NOTHING` where it escaped or landed outside all cells, `BACK` on the back of a surface.
+      distance: of the hit, metres; 1e37 where it escaped.
+      triangle, u, v: of the hit, as `Tracer.first` gives them, sample by sample.
     """
+
+    cells: Int32[np.ndarray, "samples tile"]
+    distance: Float32[np.ndarray, "samples tile"]
+    triangle: Int32[np.ndarray, " rays"]
+    u: Float32[np.ndarray, " rays"]
+    v: Float32[np.ndarray, " rays"]
+
+
+def seen_from(tracer: Tracer, receivers: Receivers, tile: slice, landing: Landing) -> Iterator[Seen]:
+    """What a tile of receivers sees, some samples at a time."""
     pattern, block, patch = receivers.pattern, receivers.block[tile], receivers.patch[tile]
     step = max(1, _CALL // len(block))
     for start in range(0, receivers.samples, step):
@@ -178,10 +191,23 @@ def seen_from(
         origins, triangle = receivers.sampler.spread(patch, pattern.place[chunk], block)
         directions = np.empty_like(origins)
         _aim(pattern.disk[chunk], block, receivers.turn[tile], triangle, tracer.frames, tracer.offset, origins, directions)
-        triangle, second, third, distance = tracer.first(origins, directions)
-        cells = np.empty((len(origins) // len(block), len(block)), np.int32)
-        _land(triangle, second, third, directions, tracer.normals, landing.chart, landing.cell, landing.part, cells.reshape(-1))
-        yield cells, distance.reshape(cells.shape)
+        triangle, u, v, distance = tracer.first(origins, directions)
+        cells = landed_on(tracer, landing, directions, triangle, u, v).reshape(-1, len(block))
+        yield Seen(cells, distance.reshape(cells.shape), triangle, u, v)
+
+
+def landed_on(
+    tracer: Tracer,
+    landing: Landing,
+    directions: Float32[np.ndarray, "rays 3"],
+    triangle: Int32[np.ndarray, " rays"],
+    u: Float32[np.ndarray, " rays"],
+    v: Float32[np.ndarray, " rays"],
+) -> Int32[np.ndarray, " rays"]:
+    """Cells of hits; see `Seen`."""
+    cells = np.empty(len(triangle), np.int32)
+    _land(triangle, u, v, directions, tracer.normals, landing.chart, landing.cell, landing.part, cells)
+    return cells
 
 
 @compiled

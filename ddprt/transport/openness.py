@@ -134,7 +134,7 @@ class _Opener:
     def backs(self, receivers: Receivers, tile: slice) -> Int[np.ndarray, " tile"]:
         """Rays of each receiver that meet the back of a surface."""
         rays = seen_from(self.tracer, receivers, tile, self.landing)
-        return np.asarray(sum((cells == BACK).sum(0) for cells, _ in rays))
+        return np.asarray(sum((seen.cells == BACK).sum(0) for seen in rays))
 
     def crossed(
         self,

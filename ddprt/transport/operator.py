@@ -7,26 +7,32 @@ back between their centres within each chart. In the end every receiver adds up 
     E = G b,    b = R (E0 + P (e_1 + e_2 + ...)),    e_1 = G R E0,    e_k+1 = G P R e_k,    all e_k on the coarse blocks
 
 A lighting is a column of these products, so one more costs its shadow rays and a column. Averaging light over a sender is the
-only bias; `experiments/bake_speed.py bias` measures it against unbiased paths.
+only bias, and near senders, where it would show, are looked at more closely (`transport/near.py`); `experiments/bake_speed.py
+bias` measures what is left against unbiased paths.
 """
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from ddprt import seeds
 from ddprt.axes import Float32, Float64, Int
 from ddprt.compiled import compiled
+from ddprt.lights import Lighting
 from ddprt.scene.atlas import Atlas, Senders
+from ddprt.transport.direct import centred
 from ddprt.transport.embree import Tracer
 from ddprt.transport.gather import Landing, Receivers, seen_from
+from ddprt.transport.near import WIDTHS, NearField
 
 _SENDER_RESOLUTION = 128  # senders along a side where nothing else is asked for
 _COARSE = 3000  # most blocks that bounces are solved on: 36 MB of matrix
 _COARSE_SAMPLES = 256  # rays of each: their noise is averaged once more over all that a texel sees
+_TOGETHER = 8  # tiles whose near rays are lit together, and that are stored at once
 _TOLERANCE = 1e-4  # of a lighting's largest indirect value: where the series stops
 _MAX_BOUNCES = 512  # a closed white room never ends; what is left is reported
 
@@ -93,6 +99,21 @@ class Operator:
         """From hits to senders."""
         return Landing.of(self.atlas, self.senders.of_texel)
 
+    def near(
+        self,
+        lightings: Sequence[Lighting],
+        direct: Float32[np.ndarray, "senders columns"],
+        *,
+        bounces: int = -1,
+        widths: float = WIDTHS,
+    ) -> NearField:
+        """Looks closer at what is within so many widths of a coarse block; arguments as for `bounce`."""
+        area = np.zeros(self.senders.count)
+        area[self.senders.of_texel] = self.coarse.area[self.coarse.of_texel]
+        lights = [centred(self.tracer, lighting) for lighting in lightings]
+        albedo, reach = self.senders.albedo.astype(np.float32), (widths**2 * area).astype(np.float32)
+        return NearField(self.tracer, self.landing, lights, direct, albedo, reach, bounces < 0)
+
     @cached_property
     def _mean(self) -> Any:
         """Sparse matrix from texels to senders: the mean by area."""
@@ -151,9 +172,9 @@ class Operator:
             count = tile.stop - tile.start
             rows = np.zeros((count, coarse.count), np.float32)
             sums = np.zeros((count, table.shape[1]), np.float32)
-            for cells, _ in seen_from(self.tracer, receivers, tile, self.landing):
-                _count_seen(cells, home, rows)
-                _add_seen(cells, table, sums)
+            for seen in seen_from(self.tracer, receivers, tile, self.landing):
+                _count_seen(seen.cells, home, rows)
+                _add_seen(seen.cells, table, sums)
             rows *= np.float32(1 / _COARSE_SAMPLES)
             return csr_array(rows) if sparse else rows, sums * np.float32(1 / _COARSE_SAMPLES)
 
@@ -168,33 +189,37 @@ class Operator:
         *,
         seed: int,
         stream: str,
+        near: NearField | None = None,
         skip: int = 0,
     ) -> Iterator[int]:
-        """Irradiance of texels for every lighting, tile by tile.
+        """Irradiance of texels for every lighting, stretch by stretch.
 
         Args:
           radiosity: from `bounce`.
           out: written in place; may lie on disk.
           rays: of each texel; 0 leaves it out.
           seed, stream: address of the random numbers.
-          skip: tiles that `out` holds already.
+          near: looks closer at near senders, if given.
+          skip: stretches that `out` holds already.
         Yields:
-          The number of texels of each finished tile, in order, the skipped ones included.
+          The number of texels of each finished stretch, in order, the skipped ones included.
         """
         table = _with_dark_row(radiosity)
 
         def work(item: tuple[int, Receivers, slice]) -> int:
-            index, receivers, tile = item
+            index, receivers, stretch = item
             if index >= skip:
-                _store(self._sums(receivers, tile, table), receivers.patch[tile], np.float32(1 / receivers.samples), out)
-            return tile.stop - tile.start
+                rng = seeds.stream(seed, "near", *stream.encode(), index)
+                sums = self._sums(receivers, stretch, table, near, rng)
+                _store(sums, receivers.patch[stretch], np.float32(1 / receivers.samples), out)
+            return stretch.stop - stretch.start
 
         groups = (
             Receivers.texels(self.atlas, int(samples), seed, stream, np.flatnonzero(rays == samples))
             for samples in np.unique(rays[rays > 0])
         )
-        tiles = ((receivers, tile) for receivers in groups for tile in receivers.tiles())
-        yield from self.tracer.map(work, ((index, *tile) for index, tile in enumerate(tiles)))
+        stretches = ((receivers, stretch) for receivers in groups for stretch in receivers.tiles(_TOGETHER))
+        yield from self.tracer.map(work, ((index, *stretch) for index, stretch in enumerate(stretches)))
 
     def gather_some(
         self,
@@ -204,11 +229,16 @@ class Operator:
         *,
         seed: int,
         stream: str,
+        near: NearField | None = None,
     ) -> Float32[np.ndarray, "lightings chosen 3"]:
         """Irradiance of a few texels in rising order, with as many rays from each."""
         receivers = Receivers.texels(self.atlas, samples, seed, stream, texels)
         table = _with_dark_row(radiosity)
-        parts = list(self.tracer.map(lambda tile: self._sums(receivers, tile, table), receivers.tiles()))
+
+        def work(stretch: slice) -> np.ndarray:
+            return self._sums(receivers, stretch, table, near, seeds.stream(seed, "near some", *stream.encode(), stretch.start))
+
+        parts = list(self.tracer.map(work, receivers.tiles(_TOGETHER)))
         return np.concatenate(parts).reshape(len(texels), -1, 3).swapaxes(0, 1) * np.float32(1 / samples)
 
     def seconds_per_ray(self, radiosity: Float32[np.ndarray, "senders columns"], samples: int, texels: int) -> float:
@@ -216,17 +246,29 @@ class Operator:
         chosen = np.unique(np.linspace(0, self.atlas.count - 1, texels).astype(int))
         receivers, table = Receivers.texels(self.atlas, samples, 0, "rate", chosen), _with_dark_row(radiosity)
         begun = time.perf_counter()
-        for _ in self.tracer.map(lambda tile: self._sums(receivers, tile, table), receivers.tiles()):
+        rng = seeds.stream(0, "rate")
+        for _ in self.tracer.map(lambda tile: self._sums(receivers, tile, table, None, rng), receivers.tiles()):
             pass
         return (time.perf_counter() - begun) / (samples * len(chosen))
 
     def _sums(
-        self, receivers: Receivers, tile: slice, table: Float32[np.ndarray, "senders_and_dark columns"]
-    ) -> Float32[np.ndarray, "tile columns"]:
-        """The radiosity that the rays of a tile meet, added up."""
-        sums = np.zeros((tile.stop - tile.start, table.shape[1]), np.float32)
-        for cells, _ in seen_from(self.tracer, receivers, tile, self.landing):
-            _add_seen(cells, table, sums)
+        self,
+        receivers: Receivers,
+        stretch: slice,
+        table: Float32[np.ndarray, "senders_and_dark columns"],
+        near: NearField | None,
+        rng: np.random.Generator,
+    ) -> Float32[np.ndarray, "stretch columns"]:
+        """The radiosity that the rays of a stretch meet, added up."""
+        sums, met = np.zeros((stretch.stop - stretch.start, table.shape[1]), np.float32), []
+        for tile in receivers.tiles(within=stretch):
+            own = slice(tile.start - stretch.start, tile.stop - stretch.start)
+            for seen in seen_from(self.tracer, receivers, tile, self.landing):
+                _add_seen(seen.cells, table, sums[own])
+                if near:
+                    met.append(near.pick(seen, own.start))
+        if near:
+            near.add(met, table, rng, sums)
         return sums
 
     def pilot(self, radiosity: Float32[np.ndarray, "senders columns"], samples: int, *, seed: int, stream: str) -> Pilot:
@@ -238,9 +280,9 @@ class Operator:
         def work(tile: slice) -> tuple[np.ndarray, np.ndarray]:
             sums = np.zeros((tile.stop - tile.start, table.shape[1]), np.float32)
             near = np.zeros(tile.stop - tile.start)
-            for cells, distance in seen_from(self.tracer, receivers, tile, self.landing):
-                _add_seen(cells, table, sums)
-                _add_nearness(cells, distance, near)
+            for seen in seen_from(self.tracer, receivers, tile, self.landing):
+                _add_seen(seen.cells, table, sums)
+                _add_nearness(seen.cells, seen.distance, near)
             mean = sums.astype(np.float64) / samples
             return near / samples, np.maximum(mean[:, -1] - (mean[:, :-1] ** 2).sum(1), 0)
 
