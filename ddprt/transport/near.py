@@ -10,7 +10,7 @@ short.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -84,22 +84,35 @@ class NearField:
         sums: Float32[np.ndarray, "receivers columns"],
     ) -> None:
         """Replaces, in sums of radiosity over rays, that of near senders by what lies where each ray met them."""
-        names = "receiver", "cell", "position", "normal"
-        near = Near(*(np.concatenate([getattr(part, name) for part in met]) for name in names))
-        weight = np.ones((len(near.cell), 3), np.float32)
+        near, weight = _joined(met), np.ones((sum(len(part.cell) for part in met), 3), np.float32)
+        places, weights = [], []
         for _ in range(_DEPTH if self.endless else 1):
             if len(near.cell) == 0:
-                return
+                break
             reflected = weight * self.albedo[near.cell]
-            places = Places.of(self.tracer, near.position, near.normal)
-            for index, lighting in enumerate(self.lightings):
-                light = mean_irradiance(self.tracer, lighting, places, rng)
-                _add_light(near.receiver, light, reflected, 3 * index, sums)
-            if not self.endless:
-                _add_rows(near.receiver, near.cell, -reflected, self.direct, sums)
-                return
-            _add_rows(near.receiver, near.cell, -weight, table, sums)
-            near, weight = self._onwards(near, reflected, table, rng, sums)
+            places.append(near)
+            weights.append(reflected)
+            if self.endless:
+                _add_rows(near.receiver, near.cell, -weight, table, sums)
+                _add_rows(near.receiver, near.cell, reflected, self.direct, sums)
+                near, weight = self._onwards(near, reflected, table, rng, sums)
+        if places:
+            self._light(_joined(places), np.concatenate(weights), rng, sums)
+
+    def _light(self, near: Near, weight: np.ndarray, rng: np.random.Generator, sums: np.ndarray) -> None:
+        """Adds the difference that direct light makes: for each lighting at a share of the places, in turn, all as likely."""
+        count = len(self.lightings)
+        turns = min(max(1, round(count**0.5)), len(near.cell))
+        order = rng.permutation(len(near.cell))
+        shares = [order[turn::turns] for turn in range(turns)]
+        places = [Places.of(self.tracer, near.position[share], near.normal[share]) for share in shares]
+        start = int(rng.integers(turns))
+        for index, lighting in enumerate(self.lightings):
+            turn = (start + index) % turns
+            share = shares[turn]
+            light = mean_irradiance(self.tracer, lighting, places[turn], rng)
+            more = weight[share] * np.float32(len(near.cell) / len(share))
+            _add_difference(near.receiver[share], near.cell[share], light, self.direct, more, 3 * index, sums)
 
     def _onwards(
         self, near: Near, weight: np.ndarray, table: np.ndarray, rng: np.random.Generator, sums: np.ndarray
@@ -125,6 +138,10 @@ class NearField:
         return Near(receiver, cell, position, self.tracer.normals[triangle])
 
 
+def _joined(parts: Sequence[Near]) -> Near:
+    return Near(*(np.concatenate([getattr(part, entry.name) for part in parts]) for entry in fields(Near)))
+
+
 def columns_of(
     light: Float32[np.ndarray, "senders columns"], chosen: Int[np.ndarray, " chosen"]
 ) -> Float32[np.ndarray, "senders chosen_columns"]:
@@ -145,11 +162,21 @@ def _pick(cells: np.ndarray, distance: np.ndarray, reach: np.ndarray, chosen: np
 
 
 @compiled
-def _add_light(receiver: np.ndarray, light: np.ndarray, weight: np.ndarray, column: int, sums: np.ndarray) -> None:
-    """Adds weighted light at points to a lighting's columns of their receivers."""
+def _add_difference(
+    receiver: np.ndarray,
+    cell: np.ndarray,
+    light: np.ndarray,
+    direct: np.ndarray,
+    weight: np.ndarray,
+    column: int,
+    sums: np.ndarray,
+) -> None:
+    """Adds to a lighting's columns of receivers the weighted difference between light at points and on their senders."""
     for ray in range(len(receiver)):
+        row, sender = receiver[ray], cell[ray]
         for channel in range(3):
-            sums[receiver[ray], column + channel] += weight[ray, channel] * light[ray, channel]
+            difference = light[ray, channel] - direct[sender, column + channel]
+            sums[row, column + channel] += weight[ray, channel] * difference
 
 
 @compiled
