@@ -22,7 +22,7 @@ from ddprt.transport.direct import Places, mean_irradiance
 from ddprt.transport.embree import Tracer, lifted
 from ddprt.transport.gather import Landing, Seen, landed_on
 
-WIDTHS = 1.0
+WIDTHS = 0.5
 """How near is near: in widths of a block that bounces are solved on, the root of its area."""
 _DEPTH = 16  # most times that a path goes on
 
