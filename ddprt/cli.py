@@ -92,6 +92,7 @@ def relight(call: Call) -> None:
     import json
 
     from ddprt.lights import load_lightings, parse_lighting
+    from ddprt.methods.method import STATUSES
     from ddprt.runtime.model_file import load_model
     from ddprt.scene.exr import write_exr
 
@@ -112,7 +113,8 @@ def relight(call: Call) -> None:
         lightings = load_lightings(source)
     for index, lighting in enumerate(lightings):
         path = out if len(lightings) == 1 else out.with_stem(f"{out.stem}_{index:03d}")
-        image = model.relight(lighting)
+        measured = model.measure(lighting)
+        image, trust = model.image(model.predict(measured)), model.trust(measured)
         if not image.any():
             print(
                 f"warning: lighting {index} lights no measurement point, so {path} is black; its lamps may stand "
@@ -121,6 +123,11 @@ def relight(call: Call) -> None:
             )
         write_exr(path, image)
         print(f"lightmap: {path}")
+        if trust is None or not measured.any():
+            continue
+        print(f"trust:    {trust.score:.2f}, an expected error of {1 - trust.score:.0%}")
+        if trust.extrapolating:
+            print(f"warning: lighting {index}: extrapolating: {STATUSES['extrapolating']}", file=sys.stderr)
 
 
 def export(call: Call) -> None:

@@ -90,6 +90,11 @@ class PointsConfig(Section):
     count: int = Field(128, ge=1, description="measurement points")
     supersample: int = Field(8, ge=1, le=64, description="samples averaged into each point")
     on: Literal["surface", "hull"] = Field("surface", description="the scene's surface, or its convex hull")
+    depth: Literal["auto"] | Annotated[float, Field(ge=0, le=8)] = Field(
+        "auto",
+        description="how far behind its surface a sample is lit, in distances between samples, to even out what lamps nearer "
+        "than that do; auto: 0.75 where there are such lamps, else 0",
+    )
     file: str = Field("", description="JSON list of {position, normal, albedo} to use instead of distributing points")
     quantity: Literal["radiosity", "irradiance"] = Field("radiosity", description="what is measured there, W/m²")
 

@@ -93,7 +93,7 @@ class Run:
 
     def fit(self, data: Dataset) -> tuple[dict[str, Any], dict[str, float]]:
         """Fits every method of the comparison and saves the main one; returns models and seconds by name."""
-        from ddprt.methods.method import STATUSES
+        from ddprt.methods.statuses import NOTES, STATUSES, worst_first
         from ddprt.runtime.train import fit_config
 
         names = [self.config.fit.method, *(name for name in self.config.methods.compare if name != self.config.fit.method)]
@@ -111,8 +111,10 @@ class Run:
                 f"warning: fit.bases: asked for {self.config.fit.bases}, the data has rank {report.numerical_rank}: "
                 f"{report.bases} are given"
             )
-        if report.status != "ok":
-            self.progress.say(f"warning: {names[0]}: {report.status}: {STATUSES[report.status]}")
+        remarks = {name: model.relighter.report.remarks for name, model in models.items()}
+        for remark in worst_first({remark for found in remarks.values() for remark in found}):
+            told = ", ".join(name for name, found in remarks.items() if remark in found)
+            self.progress.say(f"{'note' if remark in NOTES else 'warning'}: {told}: {remark}: {STATUSES.get(remark, '')}")
         main.save(self.folder / "model.ddprt")
         write_text(self.folder / "config.toml", self.config.to_toml())
         return models, seconds
@@ -130,6 +132,14 @@ class Run:
             stage.facts |= {key: evaluation.spot_check[key] for key in ("rays",) if key in evaluation.spot_check}
         summary = {key: value for key, value in evaluation.spot_check.items() if key not in ("baked", "truth", "variance")}
         evaluation.metrics["spot_check"] = summary
+        for name, model in models.items():
+            evaluation.metrics["methods"][name]["remarks"] = list(model.relighter.report.remarks)
+        report = next(iter(models.values())).relighter.report
+        evaluation.metrics["numerics"] |= {
+            "measurement_rank": list(report.ranks),
+            "ridge_second_opinion": list(report.ridge_second),
+            "leave_one_out": list(report.leave_one_out),
+        }
         evaluation.metrics["curve"] = [
             {"bases": bases, "relative_rmse": error, "projection_relative_rmse": floor}
             for bases, error, floor in evaluation.curve

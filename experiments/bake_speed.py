@@ -111,6 +111,7 @@ def bake(
     if chosen.footprints:
         for index, pooled in enumerate(tracer.map(lambda index: chosen.footprints.pooled(maps[index]), range(len(lightings)))):
             maps[index] = pooled
+    np.maximum(maps, 0, out=maps)
     return maps, time.perf_counter() - start, chosen.facts
 
 
@@ -132,9 +133,19 @@ class Truth:
 
     def error(self, maps: np.ndarray, others: np.ndarray | None = None) -> float:
         """Relative RMSE of maps, or the bias that two independent sets of maps share."""
+        return float(np.sqrt(max(self._squares(maps, others).sum(), 0.0)) / self.mean)
+
+    def _squares(self, maps: np.ndarray, others: np.ndarray | None) -> np.ndarray:
+        """Each texel's share of the squared error."""
         one, two = maps[:, self.texels], (maps if others is None else others)[:, self.texels]
-        squared = self.averaged((one - self.halves[0]) * (two - self.halves[1]))
-        return float(np.sqrt(max(squared, 0.0)) / self.mean)
+        return self.weights * np.mean((one - self.halves[0]) * (two - self.halves[1]).astype(float), (0, 2))
+
+    def between(self, maps: np.ndarray, others: np.ndarray) -> tuple[float, float]:
+        """Where the bias lies, two standard errors to both sides, by drawing texels again."""
+        squares, rng = self._squares(maps, others), np.random.default_rng(0)
+        spread = np.std([squares[rng.integers(0, len(squares), len(squares))].sum() for _ in range(200)])
+        low, high = (np.sqrt(max(squares.sum() + way * spread, 0.0)) / self.mean for way in (-2, 2))
+        return float(low), float(high)
 
     def noise(self, maps: np.ndarray, others: np.ndarray) -> float:
         """Relative RMSE of each of two independent sets of maps about their mean."""
@@ -566,15 +577,17 @@ def scaling() -> None:
 
 def bias() -> None:
     """What senders and footprints cost, against unbiased paths, on every scene that bounces light."""
-    print("scene       senders a side   noise of a bake   bias")
+    print("scene       senders a side   noise of a bake   bias (within two standard errors)")
     for name in ("cornell", "corridor", "statue", "cornell-hole", "plates"):
         on = stage(name, 256, 8, 1)
-        reference = truth(on, on.train, 1024, 4096)
+        reference = truth(on, on.train, 1024, 16384)
         for side in (32, 64, 128, 256):
             transport = on.config.transport.model_copy(update={"sender_resolution": side})
             changed = replace(on, config=on.config.model_copy(update={"transport": transport}))
             maps, other = (bake(changed, on.train, "auto", f"run {k}")[0] for k in range(2))
-            print(f"{name:12s}{side:14d}{reference.noise(maps, other):18.4f}{reference.error(maps, other):9.4f}", flush=True)
+            low, high = reference.between(maps, other)
+            noise, found = reference.noise(maps, other), reference.error(maps, other)
+            print(f"{name:12s}{side:14d}{noise:18.4f}{found:9.4f} ({low:.4f} to {high:.4f})", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,13 @@
 """Slow obvious twins: float64, loops, nothing shared with what they check but the definitions."""
 
+import mpmath
 import numpy as np
 from scipy import stats
 
+from ddprt.fitting.basis import RANK_CUT
+from ddprt.fitting.encoding import Encoding
 from ddprt.lights import Lighting
+from ddprt.methods.svd_ridge import LinearTransfer
 from ddprt.scene.mesh import Scene
 
 NUDGE = 1e-9
@@ -203,3 +207,157 @@ def inside_a_block(point: np.ndarray) -> bool:
         if point[1] < height and (np.all(side > 0) or np.all(side < 0)):
             return True
     return False
+
+
+# --- bounds of the linear algebra -------------------------------------------------------------------------------------
+
+U32, U64 = 2.0**-24, 2.0**-53
+"""Unit roundoffs of float32 and float64."""
+TINY32 = 2.0**-126
+"""Smallest normal float32; compiled code may flush what is below to 0."""
+LARGEST32 = float(np.finfo(np.float32).max)
+
+
+def rounding(operations: int, unit: float) -> float:
+    """Relative error of a sum or product after so many roundings, in any order: n u / (1 - n u) (Higham 2002, 3.1)."""
+    return operations * unit / (1 - operations * unit)
+
+
+def over_bound(error: np.ndarray | float, bound: np.ndarray | float) -> float:
+    """Worst error over its bound; 0 / 0 is 0, and what is not finite is infinitely wrong."""
+    error, bound = np.broadcast_arrays(np.abs(np.asarray(error, float)), np.asarray(bound, float))
+    if not np.isfinite(error).all() or np.isnan(bound).any():
+        return np.inf
+    shares = np.divide(error, bound, out=np.where(error > 0, np.inf, 0.0), where=bound > 0)
+    return float(shares.max(initial=0))
+
+
+def bound_scale(values: np.ndarray, channels: str) -> tuple[np.ndarray, float]:
+    """Norm of each lighting and channel, and the relative error of a float32 one.
+
+    The sum of n squares of quotients has n + 3 roundings (one of a quotient counts twice), the root halves them, root and
+    product with the peak add two, and a quotient by a reciprocal one more.
+    """
+    axes = (1,) if channels == "mono" else (1, 2)
+    size = np.sqrt((values.astype(np.longdouble) ** 2).sum(axes, keepdims=True)).astype(float)
+    terms = int(np.prod([values.shape[axis] for axis in axes]))
+    return np.broadcast_to(size, (len(values), 1, 3)), rounding(terms // 2 + 6, U32)
+
+
+def bound_power(base: np.ndarray, error: np.ndarray, exponent: float) -> tuple[np.ndarray, np.ndarray]:
+    """sign(x) |x|^p, and the error of a float32 one whose base is off by `error`.
+
+    The power moves by as much as between the ends of [|x| - error, |x| + error]; through 0 it moves by both sides. Its own
+    rounding is that of exp(p log|x|): p |log|x|| of two roundings turns into a relative error, and two more follow.
+    """
+    size = np.abs(base)
+    high, low = (size + error) ** exponent, np.maximum(size - error, 0) ** exponent
+    moved = np.where(size >= error, high - low, high + size**exponent)
+    with np.errstate(divide="ignore"):
+        logarithm = np.where(high > 0, np.abs(np.log(size + error)), 0)
+    own = high * (2 * exponent * logarithm + 4) * U32
+    return np.sign(base) * size**exponent, moved + own * (1 + 4 * U32) + TINY32
+
+
+def bound_encode(values: np.ndarray, measured: np.ndarray, encoding: Encoding) -> tuple[np.ndarray, np.ndarray]:
+    """Encoded light under the scale of what was measured, and the error of a float32 one: scale, quotient, power.
+
+    Past the range of float32 the largest number stands, and light below its smallest normal number may count as dark, as
+    `Encoding` says.
+    """
+    scale, relative = bound_scale(measured, encoding.channels)
+    dark = scale < TINY32
+    quotient = np.where(dark, 0, values / np.where(dark, 1, scale))
+    quotient = np.clip(quotient, -LARGEST32, LARGEST32)
+    error = np.abs(quotient) * (relative + 3 * U32) + np.where(dark, 0, TINY32 + TINY32 / np.where(dark, 1, scale))
+    return (quotient, error) if encoding.space == "linear" else bound_power(quotient, error, 1 / encoding.gamma)
+
+
+def bound_gram(rows: np.ndarray) -> float:
+    """How far a float64 Gram matrix of the rows, and its eigenvalues, may be off (2-norm).
+
+    Rounding of weights, differences and sums of n products: (n + 6) u64 of |A| |A|^T, whose norm is at most ||A||_F². A
+    backward stable eigensolver adds N u64 of the norm, N rows. By Weyl each squared singular value moves by no more.
+    """
+    return (rounding(rows.shape[1] + 6, U64) + rounding(len(rows), U64)) * float(np.sum(rows**2))
+
+
+def bound_singular_values(exact: np.ndarray, moved: float) -> np.ndarray:
+    """Error of singular values whose squares are off by `moved`: moved / sigma, at most its root."""
+    return moved / np.maximum(np.maximum(exact, np.sqrt(moved)), 1e-300) + U64 * exact
+
+
+def exact_ridge(X: np.ndarray, C: np.ndarray, ridge: float | np.ndarray, digits: int = 50) -> np.ndarray:
+    """M of min ||X M^T - C||² + sum of ridge_p ||M_p||² by elimination in so many decimal digits, in its smaller form."""
+    with mpmath.workdps(digits):
+        A, B = mpmath.matrix(X.tolist()), mpmath.matrix(C.tolist())
+        weight = [mpmath.mpf(float(value)) for value in np.broadcast_to(ridge, X.shape[1])]
+        if len(X) >= X.shape[1]:
+            M = ((A.T * A + mpmath.diag(weight)) ** -1 * (A.T * B)).T
+        else:
+            spread = mpmath.diag([1 / value for value in weight])
+            M = (spread * A.T * (A * spread * A.T + mpmath.eye(len(X))) ** -1 * B).T
+        return np.array(M.tolist(), dtype=float)
+
+
+def truncated_ridge(X: np.ndarray, C: np.ndarray, ridge: float, rank: int) -> np.ndarray:
+    """The same on the first `rank` singular directions alone, in float64; at ridge 0 the pseudo-inverse."""
+    Q, S, Pt = np.linalg.svd(X, full_matrices=False)
+    Q, S, Pt = Q[:, :rank], S[:rank], Pt[:rank]
+    return (C.T @ Q * (S / (S**2 + ridge))) @ Pt
+
+
+def bound_ridge(X: np.ndarray, C: np.ndarray, M: np.ndarray, ridge: float, rank: int, doubt: float = 0.0) -> np.ndarray:
+    """Entry by entry, how far a float32 M from a backward stable float64 SVD of X may be off.
+
+    With G = (X^T X + ridge)^-1, dM = (C^T - M X^T) dX G - M dX^T X G, so
+    ||dM|| <= ||dX|| (||C - X M^T|| ||G|| + 2 ||M|| ||X G||), where ||dX|| <= p u64 sigma_1 with p = lightings + points, twice
+    for an intercept's means; ||G|| = 1 / (sigma² + ridge) and ||X G|| <= 1 / max(sigma, 2 sqrt(ridge)), sigma the smallest
+    singular value. The second ||M|| ||X G|| is for a cut at rank r, where kept and dropped directions mix by ||dX|| over the
+    gap sigma_r - sigma_r+1, which then stands for sigma. Products after the SVD add p u64 ||C|| ||X G||, float32 u32 |M|, and
+    a C that is off by `doubt` (2-norm) that times ||X G||.
+    Reference: Bjorck 1996, 1.4 and 2.7; Wedin 1973.
+    """
+    S = np.append(np.linalg.svd(X, compute_uv=False), 0.0)
+    p = 2 * sum(X.shape)
+    held = rank < X.shape[1] and ridge >= (RANK_CUT * S[0]) ** 2  # nothing below the cut counts under such a ridge
+    least = 0.0 if held else S[rank - 1] - (S[rank] if rank < X.shape[1] else 0.0)
+    inverse = 1 / (least**2 + ridge)
+    slope = 1 / max(least, 2 * np.sqrt(ridge))
+    moved = rounding(p, U64) * S[0] * (np.linalg.norm(C - X @ M.T) * inverse + 2 * np.linalg.norm(M) * slope)
+    return moved + (rounding(p, U64) * np.linalg.norm(C) + doubt) * slope + U32 * np.abs(M) + TINY32
+
+
+def bound_predict(
+    relighter: LinearTransfer, encoding: Encoding, values: np.ndarray, *, clamp: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """A linear model's answer from its own stored arrays in float64, and the error of a float32 one, entry by entry.
+
+    Errors of the encoding go through |M| and |U|; sums of n products add (n + 2) u32 of their absolute values.
+    """
+    M, offset, start, U, mean = (
+        np.asarray(getattr(relighter, name), float) for name in ("matrix", "offset", "intercept", "basis", "mean")
+    )
+    frames, groups = len(values), len(M)
+    z, dz = bound_encode(values, values, encoding)
+    z, dz = (np.moveaxis(a, 2, 1) if groups == 3 else a.reshape(frames, 1, -1) for a in (z, dz))
+    z, dz = z - offset, dz + U32 * (np.abs(z - offset) + dz)
+    total = lambda a, b: np.einsum("gbp,fgp->fgb", a, b)  # noqa: E731
+    u = total(M, z) + start
+    du = total(np.abs(M), dz) + rounding(M.shape[2] + 2, U32) * (total(np.abs(M), np.abs(z) + dz) + np.abs(start))
+    y = u @ U + mean
+    dy = du @ np.abs(U) + rounding(len(U) + 2, U32) * ((np.abs(u) + du) @ np.abs(U) + np.abs(mean)) + TINY32
+    y, dy = (np.moveaxis(a, 1, 2) if groups == 3 else a.reshape(frames, -1, 3) for a in (y, dy))
+    if encoding.space == "gamma":
+        y, dy = bound_power(y, dy, encoding.gamma)
+    scale, relative = bound_scale(values, encoding.channels)
+    error = scale * (dy + (np.abs(y) + dy) * (relative + 2 * U32)) + TINY32
+    return np.clip((np.maximum(y, 0) if clamp else y) * scale, -LARGEST32, LARGEST32), error
+
+
+def exact_singular_values(columns: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Singular values of columns times the roots of their weights, with forty digits, falling."""
+    with mpmath.workdps(40):
+        roots = [mpmath.sqrt(mpmath.mpf(float(weight))) for weight in weights]
+        rows = mpmath.matrix([[mpmath.mpf(float(v)) * root for v, root in zip(row, roots, strict=True)] for row in columns])
+        return np.array([float(value) for value in mpmath.svd_r(rows, compute_uv=False)])

@@ -74,7 +74,10 @@ def test_run_leaves_what_is_promised(done: Path, job: Path) -> None:
     keys += " worst_lighting_relative_rmse fit_seconds relight_seconds bytes bases status"
     assert set(keys.split()) <= set(metrics["methods"]["svd-ridge"])
     assert set(metrics["floors"]) == {"noise_relative_rmse", "projection_relative_rmse", "mean_relative_rmse"}
-    assert set(metrics["numerics"]) == {"measurement_condition", "numerical_rank", "ridge", "ridge_chosen_by"}
+    numerics = "measurement_condition measurement_rank numerical_rank ridge ridge_chosen_by ridge_second_opinion leave_one_out"
+    assert set(metrics["numerics"]) == set(numerics.split())
+    assert set(metrics["trust"]) == {"spearman", "median_expected_error", "median_error", "flagged_share", "unseen"}
+    assert all(isinstance(score["remarks"], list) for score in metrics["methods"].values())
     assert metrics["floors"]["projection_relative_rmse"] <= metrics["methods"]["svd-ridge"]["relative_rmse"]
     run = json.loads((done / "run.json").read_text())
     assert {"stages", "effects", "seed", "machine", "seconds"} <= set(run)

@@ -1,5 +1,7 @@
 """The law book: what every entry of METHODS must keep, in every space and channel mode."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ import ddprt
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.methods import METHODS
-from ddprt.methods.method import STATUSES
+from ddprt.methods.method import STATUSES, Frame
 from ddprt.runtime import model as runtime
 from ddprt.runtime.model import Model
 from ddprt.scene.mesh import Scene
@@ -204,3 +206,15 @@ def test_more_bases_than_rank_gives_fewer_and_says_so(data: Dataset) -> None:
     report = ddprt.fit(data, bases=500).relighter.report
     assert report.bases == report.numerical_rank == 72
     assert report.status == "rank_deficient"
+
+
+def test_gradients_are_finite_in_the_dark(model: Model) -> None:
+    places = model._places
+
+    def total(values: jax.Array) -> jax.Array:
+        scale = model.encoding.scale(values)
+        frame = Frame(model.encoding.encode(values, scale), *places)
+        return model.encoding.decode(model.relighter.predict(frame), scale).sum()
+
+    for values in (jnp.zeros((2, 24, 3)), jnp.zeros((2, 24, 3)).at[0, 3, 0].set(1.0)):
+        assert jnp.isfinite(jax.grad(total)(values)).all()

@@ -1,6 +1,7 @@
 """Lightings and measurement points: addressed by index, in free space, evenly spread, on the surface."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,13 @@ from ddprt.errors import UserError
 from ddprt.lights import Lighting, lighting_json
 from ddprt.sampling.lightings import Draw, draw_lightings
 from ddprt.sampling.points import eliminate, load_samples, place_samples
+from ddprt.scene.atlas import SHUT, Atlas
 from ddprt.scene.checks import checked
 from ddprt.scene.library import build
 from ddprt.scene.mesh import Material, Scene
 from ddprt.scene.shapes import box, faceted
 from ddprt.transport.embree import Tracer
+from ddprt.transport.openness import build_open_atlas
 
 
 def true_clearance(scene: Scene, point: np.ndarray) -> float:
@@ -250,6 +253,36 @@ def test_samples_share_the_area_fairly(cornell: Scene) -> None:
     # Blue noise varies less than independent draws would: 3 standard deviations of those.
     expected = 512 * np.array(areas) / sum(areas)
     assert (np.abs(counts - expected) < 3 * np.sqrt(expected)).all()
+
+
+def test_samples_stay_in_the_open(cornell: Scene) -> None:
+    """None on the floor under a block; the rest has the area and the spacing of what is left."""
+    atlas, _ = build_open_atlas(Tracer.of(cornell), cornell, 64)
+    samples = place_samples(cornell, 1024, on="surface", seed=0, atlas=atlas)
+    whole = place_samples(cornell, 1024, on="surface", seed=0)
+    under = [[oracles.inside_a_block(place) for place in at.position + 1e-6 * at.normal] for at in (samples, whole)]
+    # A candidate is judged by squares of a 25th of a texel: what a block's rim makes of one is no wider.
+    hidden = 1 - atlas.area.sum() / cornell.areas.sum()
+    assert (sum(under[0]), sum(under[1]) > 0.5 * 1024 * hidden) == (0, True)
+    assert samples.spacing == pytest.approx(np.sqrt(atlas.area.sum() / 1024), rel=1e-12)
+    assert spacing(samples.position).min() > 0.5 * packing(atlas.area.sum(), 1024)
+
+
+@pytest.mark.parametrize("name", ["furnace", "convex", "plates"])
+def test_where_nothing_is_hidden_samples_are_the_same(name: str) -> None:
+    scene = build(name)
+    atlas, hidden = build_open_atlas(Tracer.of(scene), scene, 64)
+    assert not any(hidden.values())
+    once, again = (place_samples(scene, 64, on="surface", seed=0, atlas=given) for given in (None, atlas))
+    assert (once.digest, once.spacing) == (again.digest, again.spacing)
+
+
+def test_too_little_in_the_open_is_refused(cornell: Scene, cornell_atlas: Atlas) -> None:
+    shut = replace(cornell_atlas, slot=np.full_like(cornell_atlas.slot, SHUT))
+    with pytest.raises(UserError, match=r"points\.count: got 8 samples to place, but 0 of 40 candidates") as caught:
+        place_samples(cornell, 8, on="surface", seed=0, atlas=shut)
+    assert "\n" not in str(caught.value)
+    assert len(place_samples(cornell, 8, on="hull", seed=0, atlas=shut).position) == 8  # a hull is not unwrapped
 
 
 def test_samples_depend_on_the_seed_alone(cornell: Scene) -> None:

@@ -69,7 +69,10 @@ class Dataset:
         """Position, normal, geometric_normal, albedo, area and coverage of the covered texels."""
         images = {name: read_exr(self.folder / "atlas" / f"{name}.exr")[0] for name in _GBUFFER}
         covered = images["coverage"][..., 0] > 0
-        return {name: image[covered] for name, image in images.items()}
+        values = {name: image[covered] for name, image in images.items()}
+        for name in _GBUFFER:
+            _refuse_odd(self.folder / "atlas" / f"{name}.exr", values[name], signed="normal" in name or name == "position")
+        return values
 
     @cached_property
     def covered(self) -> Bool[np.ndarray, "height width"]:
@@ -85,7 +88,8 @@ class Dataset:
     def samples(self) -> Samples:
         """Where direct light was measured, all supersamples in progressive order."""
         tensors = read_tensors(self.folder / "points.safetensors")
-        return Samples(tensors["position"], tensors["normal"], tensors["albedo"], float(tensors["spacing"][0]))
+        spacing, depth = float(tensors["spacing"][0]), float(tensors.get("depth", np.zeros(1))[0])
+        return Samples(tensors["position"], tensors["normal"], tensors["albedo"], spacing, depth)
 
     @cached_property
     def occluders(self) -> Float64[np.ndarray, "triangles 3 3"]:
@@ -101,13 +105,21 @@ class Dataset:
         """Lightmaps of the covered texels in W/m²; kind is "direct", "indirect" or (held-out lightings) "noise"."""
         values = np.empty((len(indices), int(self.covered.sum()), 3), np.float32)
         for row, index in enumerate(indices):
-            values[row] = read_map(self.folder / map_name(kind, index))[self.covered]
+            path = self.folder / map_name(kind, index)
+            image = read_map(path)
+            if image.shape != (*self.covered.shape, 3):
+                raise UserError(f"{path}: got a map of shape {image.shape}, expected {(*self.covered.shape, 3)}; bake it again")
+            values[row] = image[self.covered]
+            _refuse_odd(path, values[row], signed=kind == "noise")
         return values
 
     def measured(self, indices: Sequence[int]) -> Float32[np.ndarray, "lightings samples 3"]:
         """Direct irradiance at all samples, W/m²."""
-        tensors = [read_tensors(self.folder / map_name("measured", index)) for index in indices]
-        return np.stack([entry["irradiance"] for entry in tensors]) if tensors else np.empty((0, 0, 3), np.float32)
+        paths = [self.folder / map_name("measured", index) for index in indices]
+        rows = [read_tensors(path)["irradiance"] for path in paths]
+        for path, row in zip(paths, rows, strict=True):
+            _refuse_odd(path, row)
+        return np.stack(rows) if rows else np.empty((0, 0, 3), np.float32)
 
     def values(self, indices: Sequence[int], points: int, quantity: str) -> Float32[np.ndarray, "lightings points 3"]:
         """What an engine measures: supersamples averaged into the nearest of the first `points` samples.
@@ -126,9 +138,10 @@ def average_into_points(
     """Supersampled irradiance to one value per point; see `Dataset.values`."""
     home = samples.nearest_point(points)
     weighted = irradiance * samples.albedo.astype(np.float32) if quantity == "radiosity" else irradiance
-    share = np.zeros((points, len(home)), np.float32)
-    share[home, np.arange(len(home))] = 1 / np.bincount(home, minlength=points)[home]
-    return share @ weighted
+    # Sums in the order of the samples: a product of matrices would depend on the number of threads.
+    start = np.searchsorted(np.sort(home), np.arange(points))
+    sums = np.add.reduceat(weighted[:, np.argsort(home, kind="stable")], start, axis=1)
+    return sums / np.bincount(home)[:, None].astype(np.float32)
 
 
 def open_dataset(folder: str | Path) -> Dataset:
@@ -250,7 +263,8 @@ def write_map(path: Path, image: Float32[np.ndarray, "height width 3"]) -> None:
         raise UserError(
             f"{path.name}: got light past the range of float32; lower the intensities or keep lamps off the surfaces"
         )
-    exposure = exposure_for(float(np.abs(image).max()))
+    # The brightest value goes to the top of the halves' range, so that what is 2^29 times fainter keeps all its bits.
+    exposure = exposure_for(float(np.abs(image).max())) - 15
     attributes = {"ddprt_exposure": str(exposure), "ddprt_quantity": "irradiance", "ddprt_unit": "W/m2"}
     write_exr(path, np.ldexp(image, -exposure), half=True, attributes=attributes)
 
@@ -263,8 +277,9 @@ def read_map(path: Path) -> Float32[np.ndarray, "height width 3"]:
     """
     image, attributes = read_exr(path)
     try:
-        return np.ldexp(image, int(attributes.get("ddprt_exposure", "0")))
-    except ValueError:
+        with np.errstate(over="ignore"):  # what becomes infinite is refused where light is read
+            return np.ldexp(image, int(attributes.get("ddprt_exposure", "0")))
+    except (ValueError, OverflowError):
         raise UserError(
             f"{path}: got exposure {attributes['ddprt_exposure']!r}, expected a whole number; bake it again"
         ) from None
@@ -283,6 +298,13 @@ def write_description(folder: Path, description: dict[str, Any]) -> None:
     """dataset.json, whole or not at all."""
     make_folder(folder)
     write_text(folder / "dataset.json", json.dumps(description, indent=1) + "\n")
+
+
+def _refuse_odd(path: Path, values: np.ndarray, *, signed: bool = False) -> None:
+    """Stops at the first file with values that no light, area or albedo has."""
+    if values.size and not (np.isfinite(values).all() and (signed or values.min() >= 0)):
+        got = "NaN or infinity" if not np.isfinite(values).all() else f"negative values (down to {values.min():.3g})"
+        raise UserError(f"{path}: got {got}, expected finite values, 0 or more; bake it again or mend its source")
 
 
 def _sha256(path: Path) -> str:

@@ -24,11 +24,22 @@ LAYER = 4  # bases per RGBA texture
 
 DECODE = [
     "home = points.home; x[p] = mean over samples k with home[k] == p of (albedo[k] *) E_direct[k], per colour channel",
+    "where depth is not 0: E_direct = visible from position * max(0, 2 E(position - depth * normal) - E(position - 2 depth * "
+    "normal)), lit without shadows and with the same normal; depth in metres",
     "s = norm of x over the points (per channel for mono, over all for multi); s = 0 gives black",
     "z = x / s; in gamma space z = sign(z) |z|^(1/gamma)",
     "u = matrix (z - offset) + intercept",
     "y = mean texture + sum over bases of u[b] * basis texture b",
     "y = max(y, 0); in gamma space y = y^gamma; E_indirect = s * y, in W/m²; radiance = albedo / pi * E_indirect",
+]
+
+
+TRUST = [
+    "x as above, encoded: z; per channel for mono, over all for multi; weight of a channel w = s² / sum of s²",
+    "p = directions z; r = z - directions^T p",
+    "novelty = sum over channels of w (sum of shares p² + sum of r²) / (sum of z²), at most 1",
+    "expected error = novelty^exponent; trust = 1 - expected error; 1 where s is 0; extrapolating where novelty > level",
+    "to fade: k = clip(trust / (1 - fade_from), 0, 1); k = k² (3 - 2 k); E = k E + (1 - k) s E(mean)",
 ]
 
 
@@ -97,6 +108,13 @@ def export_textures(
     }
     write_tensors(folder / "transfer.safetensors", {name: value.astype(np.float32) for name, value in tensors.items()})
     write_text(folder / "points.json", json.dumps({name: np.asarray(value).tolist() for name, value in points.items()}) + "\n")
+    trust = None
+    if model.yardstick is not None:
+        ruler = model.yardstick
+        write_tensors(folder / "trust.safetensors", {name: getattr(ruler, name) for name in ("directions", "shares", "mean")})
+        written.append(folder / "trust.safetensors")
+        numbers = {name: getattr(ruler, name) for name in ("exponent", "level", "fade_from")}
+        trust = {"file": "trust.safetensors", **numbers, "formula": TRUST}
     manifest: dict[str, Any] = {
         "schema": SCHEMA,
         "ddprt": __version__,
@@ -107,6 +125,7 @@ def export_textures(
         "points": model.points,
         "samples": len(model.samples.position),
         "quantity": model.quantity,
+        "depth": model.samples.depth,
         "space": model.encoding.space,
         "gamma": model.encoding.gamma,
         "channels": model.encoding.channels,
@@ -120,6 +139,7 @@ def export_textures(
         "uv": "lightmap coordinates (TEXCOORD_1), origin top-left, row 0 at the top",
         "unit": "irradiance in W/m2, before albedo",
         "decode": DECODE,
+        "trust": trust,
     }
     write_text(folder / "manifest.json", json.dumps(manifest, indent=1, ensure_ascii=False) + "\n")
     return [*written, folder / "transfer.safetensors", folder / "points.json", folder / "manifest.json"]

@@ -1,21 +1,23 @@
 """The basis: what indirect light of this scene looks like, in as few maps as possible.
 
 Right singular vectors of the (columns x entries) data by its Gram matrix, accumulated in float64 from float32 data tile by
-tile. That is as accurate as a full SVD of the same data down to sigma_k / sigma_1 of about 2e-8, at a fifth of its time; a
-float32 Gram matrix would be wrong from 5e-4 on.
+tile. Squaring costs half of the digits: the square of sigma_k is good to a few eps64 sigma_1², so sigma_k itself to 1 % only
+down to some 4e-7 sigma_1. What lies deeper is looked at again without what lies above it: a second Gram matrix, of the data
+projected on the deep left vectors, is as accurate relative to the largest deep value. Both together tell all that is light
+rather than rounding (`RANK_CUT`); docs/stability.md has the table that this choice was made from.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-_TILE = 1 << 14  # entries turned to float64 at once
+_TILE = 1 << 10  # entries turned to float64 at once: 256 columns of them fit a core's second cache
 RANK_CUT = 1e-7
 """Singular values below this share of the largest are rounding of the float32 data, not light."""
 
@@ -27,11 +29,13 @@ Status = Literal["ok", "rank_deficient", "no_signal"]
 class Basis:
     """An orthonormal basis under entry weights: U W U^T = Id.
 
+    Vectors of equal singular values are some orthonormal basis of the space that they span: only that space has a meaning.
+
     Attributes:
       vectors: U, float32; the entry of largest magnitude of each is positive.
       mean: subtracted from every column before, zero where nothing was.
       coefficients: of the training columns, float64.
-      singular_values: of the weighted data, all of them, falling, float64.
+      singular_values: of the weighted data, all of them, falling, float64; to 1 % down to `RANK_CUT` times the largest.
       rank: numerical rank of the data.
       status: "ok"; "rank_deficient": fewer vectors than asked for, since the data has no more; "no_signal": no light at all.
     """
@@ -54,63 +58,138 @@ def fit_basis(
       weights: of the entries, summing to 1.
       bases: how many vectors; fewer come back if the data has a lower rank.
       centre: subtract the mean column first.
+    Raises:
+      ValueError: columns or weights are not finite, or a weight is negative.
     Reference: Belcour et al., HPG 2022, Eq. 7 and 8; Turk and Pentland 1991 for the small matrix.
     """
     if len(columns) == 0 or bases == 0:
         empty = jnp.zeros((0, columns.shape[1]), jnp.float32)
         return Basis(empty, jnp.zeros(columns.shape[1]), jnp.zeros((len(columns), 0)), jnp.zeros(len(columns)), 0, "no_signal")
     with jax.enable_x64(True):
-        mean, sigma, rotation = _decompose(columns, weights, centre)
+        mean = jnp.mean(columns, 0, dtype=jnp.float64) if centre else None
+        sigma, rotation = _decompose(columns, weights, mean)
+        if not np.isfinite(np.asarray(sigma)).all():
+            raise ValueError("got NaN, infinity or a negative weight, expected finite columns and weights of 0 or more")
+        if deep := _deep(np.asarray(sigma)):
+            sigma, rotation = _sharpen(columns, weights, mean, sigma, rotation, *deep)
         rank = int(np.sum(np.asarray(sigma) > RANK_CUT * float(sigma[0])))
         kept = min(bases, rank)
-        vectors, coefficients = _build(columns, weights, mean, rotation[:, :kept] / sigma[:kept])
+        vectors, coefficients = _build(columns, weights, mean, sigma[:kept], rotation[:, :kept])
         status: Status = "no_signal" if rank == 0 else "rank_deficient" if kept < bases else "ok"
-        return Basis(vectors, mean.astype(jnp.float32), coefficients, sigma, rank, status)
+        shown = jnp.zeros(columns.shape[1], jnp.float32) if mean is None else mean.astype(jnp.float32)
+        return Basis(vectors, shown, coefficients, sigma, rank, status)
 
 
-@partial(jax.jit, static_argnames="centre")
-def _decompose(columns: Array, weights: Array, centre: bool) -> tuple[Array, Array, Array]:
-    """Mean column, singular values and left singular vectors of the weighted data, falling, in float64."""
-    mean = jnp.mean(columns, 0, dtype=jnp.float64) if centre else jnp.zeros(columns.shape[1], jnp.float64)
+def _deep(sigma: np.ndarray) -> tuple[int, int] | None:
+    """First and last (exclusive) of the values that the first Gram matrix does not tell to 1 % and that may still be light.
 
-    def add(gram: Array, columns: Array, mean: Array, weights: Array) -> Array:
-        rows = (columns - mean) * jnp.sqrt(weights.astype(jnp.float64))
-        return gram + jnp.matmul(rows, rows.T, precision="highest")
-
-    gram = _over_tiles(add, jnp.zeros((len(columns), len(columns)), jnp.float64), columns, mean, weights)
-    squares, rotation = jnp.linalg.eigh(gram)
-    return mean, jnp.sqrt(jnp.maximum(squares[::-1], 0)), rotation[:, ::-1]
+    Its squares are good to sqrt(n) eps sigma_1² (rounding errors of random signs; measured, a third of that), so that roots
+    are good to 1 % from 50 sqrt(n) eps on. Well below the rank cut there is nothing to be told.
+    """
+    n = len(sigma)
+    first = int(np.sum(sigma > np.sqrt(50 * np.sqrt(n) * np.finfo(float).eps) * sigma[0]))
+    last = int(np.sum(sigma > RANK_CUT / 4 * sigma[0]))
+    if last <= first:
+        return None
+    # In steps, since every other number is compiled anew.
+    step = -(-n // 32)
+    return max(0, last - -(-(last - first) // step) * step), last
 
 
 @jax.jit
-def _build(columns: Array, weights: Array, mean: Array, turn: Array) -> tuple[Array, Array]:
+def _decompose(columns: Array, weights: Array, mean: Array | None) -> tuple[Array, Array]:
+    """Singular values and left singular vectors of the weighted data, falling, in float64."""
+
+    def add(gram: _Gram, start: Array | int, columns: Array, weights: Array, mean: Array | None) -> _Gram:
+        return _add_square(gram, _centred(columns, mean) * jnp.sqrt(weights.astype(jnp.float64)))
+
+    return _eigen(_over_tiles(add, _no_square(len(columns)), columns, weights, mean))
+
+
+@partial(jax.jit, static_argnames=("first", "last"))
+def _sharpen(
+    columns: Array, weights: Array, mean: Array | None, sigma: Array, rotation: Array, first: int, last: int
+) -> tuple[Array, Array]:
+    """Singular values and left vectors, those from `first` to `last` taken from the data projected on them alone."""
+    deep = rotation[:, first:last].T
+
+    def add(gram: _Gram, start: Array | int, columns: Array, weights: Array, mean: Array | None) -> _Gram:
+        part = jnp.matmul(deep, _centred(columns, mean), precision="highest")
+        return _add_square(gram, part * jnp.sqrt(weights.astype(jnp.float64)))
+
+    values, turn = _eigen(_over_tiles(add, _no_square(last - first), columns, weights, mean))
+    sigma = sigma.at[first:last].set(values)
+    rotation = rotation.at[:, first:last].set(jnp.matmul(deep.T, turn, precision="highest"))
+    order = jnp.argsort(-sigma)
+    return sigma[order], rotation[:, order]
+
+
+@jax.jit
+def _build(columns: Array, weights: Array, mean: Array | None, sigma: Array, rotation: Array) -> tuple[Array, Array]:
     """Orthonormal vectors (float32) and the columns' coefficients (float64)."""
-    if turn.shape[1] == 0:
-        return jnp.zeros((0, columns.shape[1]), jnp.float32), jnp.zeros((len(columns), 0), jnp.float64)
-    vectors = jnp.matmul(turn.T, columns - mean, precision="highest")
+    bases, entries = len(sigma), columns.shape[1]
+    if bases == 0:
+        return jnp.zeros((0, entries), jnp.float32), jnp.zeros((len(columns), 0), jnp.float64)
+    turn = (rotation / sigma).T
+
+    def add(
+        total: tuple[Array, Array], start: Array | int, columns: Array, weights: Array, mean: Array | None
+    ) -> tuple[Array, Array]:
+        vectors, overlap = total
+        part = jnp.matmul(turn, _centred(columns, mean), precision="highest")
+        overlap = overlap + jnp.matmul(part * weights, part.T, precision="highest")
+        return jax.lax.dynamic_update_slice_in_dim(vectors, part, start, -1), overlap
+
+    empty = jnp.zeros((bases, entries), jnp.float64), jnp.zeros((bases, bases), jnp.float64)
+    vectors, overlap = _over_tiles(add, empty, columns, weights, mean)
     # One Cholesky step removes what rounding left of the overlap; then the sign rule.
-    overlap = jnp.matmul(vectors * weights, vectors.T, precision="highest")
-    vectors = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(overlap), vectors, lower=True)
-    peak = jnp.take_along_axis(vectors, jnp.argmax(jnp.abs(vectors), 1)[:, None], 1)
-    vectors = (vectors * jnp.where(peak < 0, -1, 1)).astype(jnp.float32)
-
-    def add(total: Array, columns: Array, mean: Array, weights: Array, vectors: Array) -> Array:
-        return total + jnp.matmul((columns - mean) * weights, vectors.T.astype(jnp.float64), precision="highest")
-
-    empty = jnp.zeros((len(columns), len(vectors)), jnp.float64)
-    return vectors, _over_tiles(add, empty, columns, mean, weights, vectors)
+    L = jnp.linalg.cholesky(overlap)
+    straight = jax.scipy.linalg.solve_triangular(L, jnp.eye(bases), lower=True)
+    vectors = jnp.matmul(straight, vectors, precision="highest")
+    sign = jnp.where(jnp.max(vectors, 1) < -jnp.min(vectors, 1), -1, 1)
+    # X = V S Y and Y = L U: the coefficients X W U^T need no further product with the data.
+    coefficients = jnp.matmul(rotation * sigma, L, precision="highest") * sign
+    return (vectors * sign[:, None]).astype(jnp.float32), coefficients
 
 
-def _over_tiles(add: Callable[..., Array], total: Array, *arrays: Array) -> Array:
+def _centred(columns: Array, mean: Array | None) -> Array:
+    return columns.astype(jnp.float64) if mean is None else columns - mean
+
+
+# A Gram matrix as the products of its rows' upper and lower half: A A^T, A B^T and B B^T, a quarter less work than the whole.
+_Gram = tuple[Array, Array, Array]
+
+
+def _no_square(n: int) -> _Gram:
+    a, b = n // 2, n - n // 2
+    return jnp.zeros((a, a), jnp.float64), jnp.zeros((a, b), jnp.float64), jnp.zeros((b, b), jnp.float64)
+
+
+def _add_square(gram: _Gram, rows: Array) -> _Gram:
+    a, b = jnp.split(rows, [len(rows) // 2])
+    pairs = ((a, a), (a, b), (b, b))
+    aa, ab, bb = (old + jnp.matmul(x, y.T, precision="highest") for old, (x, y) in zip(gram, pairs, strict=True))
+    return aa, ab, bb
+
+
+def _eigen(gram: _Gram) -> tuple[Array, Array]:
+    """Roots of the eigenvalues, falling, and eigenvectors."""
+    aa, ab, bb = gram
+    squares, vectors = jnp.linalg.eigh(jnp.block([[aa, ab], [ab.T, bb]]))
+    return jnp.sqrt(jnp.maximum(squares[::-1], 0)), vectors[:, ::-1]
+
+
+def _over_tiles(add: Callable[..., Any], total: Any, *arrays: Array | None) -> Any:
     """Folds `add` over tiles of the last axis, so that only one tile at a time is float64."""
-    entries = arrays[0].shape[-1]
-    whole = entries // _TILE
+    entries = jax.tree.leaves(arrays)[0].shape[-1]
+    whole = entries // _TILE * _TILE
 
-    def step(i: Array, total: Array) -> Array:
-        return add(total, *(jax.lax.dynamic_slice_in_dim(array, i * _TILE, _TILE, -1) for array in arrays))
+    def step(i: Array, total: Any) -> Any:
+        tile = jax.tree.map(lambda array: jax.lax.dynamic_slice_in_dim(array, i * _TILE, _TILE, -1), arrays)
+        return add(total, i * _TILE, *tile)
 
-    total = jax.lax.fori_loop(0, whole, step, total) if whole else total
-    return add(total, *(array[..., whole * _TILE :] for array in arrays)) if entries % _TILE else total
+    total = jax.lax.fori_loop(0, whole // _TILE, step, total) if whole else total
+    return add(total, whole, *jax.tree.map(lambda array: array[..., whole:], arrays)) if entries > whole else total
 
 
 def entry_weights(area: np.ndarray, weights: Literal["area", "texel"], channels: Literal["mono", "multi"]) -> np.ndarray:

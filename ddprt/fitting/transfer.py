@@ -6,7 +6,6 @@ costs one product after a single SVD: M(lambda) = C^T Q diag(S / (S² + lambda))
 """
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Literal
 
 import jax
@@ -15,12 +14,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ddprt.errors import UserError
+from ddprt.fitting.selection import Spectrum, choose_ridge, decompose, left_out
 
-RANK_CUT = 1e-7
-"""Singular values below this share of the largest are rounding of the float32 measurements."""
-_RIDGES = 57  # four per decade, from 1e-13 to 10 times the largest squared singular value
 ILL_CONDITIONED = 1e6
 """Condition number past which coefficients of float32 measurements are not to be trusted without a ridge."""
+_ENDLESS = 1e30  # times the largest squared singular value: a ridge that leaves nothing of M
+
+Status = Literal["ok", "rank_deficient", "ill_conditioned", "no_signal", "overdamped", "overfitted"]
 
 
 @dataclass(frozen=True)
@@ -32,14 +32,16 @@ class Transfer:
       offset: mean of the measured rows, zero without intercept.
       intercept: mean of the coefficients, zero without intercept.
       ridge: the weight that was used; for a ridge per point its mean.
-      singular_values: of the measurements, falling.
+      singular_values: of the measurements with twins merged, falling.
       condition: largest singular value over the smallest one that counts towards the rank; 0 without signal.
       rank: numerical rank of the measurements.
       leave_one_out: root of the weighted mean squared leave-one-out residual of a row's coefficients.
-      path: leave-one-out residual at every ridge tried, as (ridge, residual) rows; empty unless it was chosen.
-      status: "ok"; "rank_deficient": the measurements have fewer independent directions than there are coefficients to tell
-        apart; "ill_conditioned": directions that nearly carry nothing decide, and no ridge holds them back; "no_signal":
-        nothing was measured.
+      path: leave-one-out residual at every ridge tried, as (ridge, residual) rows; empty unless it was chosen here.
+      remarks: all of these that hold, the worst first. "no_signal": nothing was measured; "overfitted": a lighting that is
+        left out is predicted no better than by black (by the mean, with an intercept); "ill_conditioned": directions that
+        nearly carry nothing decide, and no ridge holds them back; "overdamped": the ridge takes more than half even of the
+        strongest direction; "rank_deficient": the measurements have fewer independent directions than there are coefficients
+        to tell apart.
     """
 
     matrix: Float[Array, "bases points"]
@@ -50,15 +52,20 @@ class Transfer:
     condition: float
     rank: int
     leave_one_out: float
-    path: Float[Array, "ridges 2"]
-    status: Literal["ok", "rank_deficient", "ill_conditioned", "no_signal"]
+    path: Float[np.ndarray, "ridges 2"]
+    remarks: tuple[Status, ...]
+
+    @property
+    def status(self) -> Status:
+        """The first of the remarks, "ok" where there is none."""
+        return self.remarks[0] if self.remarks else "ok"
 
 
 def fit_transfer(
     measured: Float[Array, "lightings points"],
     coefficients: Float[Array, "lightings bases"],
     *,
-    ridge: float | tuple[float, ...] | Literal["auto"] = "auto",
+    ridge: float | int | tuple[float, ...] | Literal["auto"] = "auto",
     importance: Float[Array, " lightings"] | None = None,
     intercept: bool = False,
 ) -> Transfer:
@@ -70,85 +77,85 @@ def fit_transfer(
       measured: X, scaled and encoded direct light at the points, dimensionless; rows of zeros train nothing.
       coefficients: C, those of the scaled and encoded indirect light.
       ridge: weight in units of measured², >= 0; 0 gives the pseudo-inverse; one value per point weighs them apart;
-        "auto" minimises the leave-one-out residual.
-      importance: weight of each row's leave-one-out residual, s² to agree with errors in W/m²; 1 where it is left out.
+        "auto" minimises this matrix' own mean squared leave-one-out residual (methods choose for all channels at once, see
+        `choose_ridge`).
+      importance: weight of each row's leave-one-out residual, s² to agree with errors in W/m²; 1 where it is left out, or
+        where all of it is zero.
       intercept: fit one, by centring both sides.
     Raises:
-      UserError: negative ridges, or not as many as points; a mix of zero and positive ridges per point.
+      UserError: ridges that are negative or not finite, or not as many as points; a mix of zero and positive ones.
       ValueError: the two sides have different numbers of lightings.
     """
     if len(measured) != len(coefficients):
         raise ValueError(f"got {len(measured)} rows of measurements and {len(coefficients)} of coefficients, expected as many")
     weight = np.ones(len(measured)) if importance is None else np.asarray(importance, np.float64)
-    per_point = _per_point(ridge, measured.shape[1])
-    stretch = np.ones(measured.shape[1]) if per_point is None else 1 / np.sqrt(per_point)
-    # Per-point ridges are in the stretched measurements already, so their lambda is 1; -1 stands for "auto".
-    given = -1.0 if ridge == "auto" else 1.0 if per_point is not None else float(ridge)  # type: ignore[arg-type]
-    if given < 0 and ridge != "auto":
-        raise UserError(f"fit.ridge: got {given:g}, expected 0 or more")
+    stretch = point_stretch(ridge, measured.shape[1])
+    spectrum = decompose(measured, coefficients, stretch=stretch, intercept=intercept)
+    if ridge != "auto":
+        return solve_transfer(spectrum, ridge, stretch, weight)
+    choice = choose_ridge([spectrum], [weight], [np.arange(len(weight))], power=2.0)
+    return solve_transfer(spectrum, choice.ridge, None, weight, path=choice.path[:, :2])
+
+
+def solve_transfer(
+    spectrum: Spectrum,
+    ridge: float | int | tuple[float, ...],
+    stretch: Float[np.ndarray, " points"] | None,
+    weight: Float[np.ndarray, " lightings"],
+    *,
+    path: Float[np.ndarray, "ridges 2"] = np.zeros((0, 2)),  # noqa: B008
+) -> Transfer:
+    """The map at one ridge, of a problem decomposed before; `stretch` from `point_stretch`, the rest as in `fit_transfer`."""
+    # Ridges of the points are in the stretched measurements already, so their lambda is 1.
+    used = float(ridge) if stretch is None else 1.0  # type: ignore[arg-type]
+    if not 0 <= used < np.inf:
+        raise UserError(f"fit.ridge: got {used:g}, expected a finite number, 0 or more")
+    largest, rank, count = spectrum.largest, spectrum.rank, len(spectrum.right)
+    S = np.asarray(spectrum.values)[:count]
+    shrink = np.divide(S, S**2 + used, out=np.zeros_like(S), where=np.arange(len(S)) < rank)
     with jax.enable_x64(True):
-        M, offset, start, S, used, loo, path = _solve(measured, coefficients, weight, stretch, given, intercept)
-        values = np.asarray(S)
-    rank = int(np.sum(values > RANK_CUT * values[0])) if values[0] > 0 else 0
-    condition = float(values[0] / values[rank - 1]) if rank else 0.0
-    status = _status(values[0], rank, coefficients.shape[1], condition, float(used))
-    shown = float(np.mean(per_point)) if per_point is not None else float(used)
-    kept = path if ridge == "auto" else path[:0]
-    return Transfer(M, offset, start, shown, S, condition, rank, float(loo), kept, status)
+        matrix = jnp.matmul(spectrum.turned[: len(S)].T * shrink, spectrum.right[: len(S)], precision="highest")
+        matrix = matrix if stretch is None else matrix * stretch
+        M, d0, c0 = (part.astype(jnp.float32) for part in (matrix, spectrum.offset, spectrum.start))
+    squares = left_out(spectrum, np.array([used]))[0][0]
+    weight = weight / weight.max() if weight.max(initial=0) > 0 else np.ones(len(weight))
+    remarks: dict[Status, bool] = {
+        "no_signal": rank == 0,
+        "overfitted": rank > 0 and weight @ squares > weight @ _answering_nothing(spectrum),
+        "ill_conditioned": rank > 0 and largest > ILL_CONDITIONED * S[rank - 1] and used <= (largest / ILL_CONDITIONED) ** 2,
+        "overdamped": rank > 0 and used > largest**2,
+        "rank_deficient": 0 < rank < spectrum.turned.shape[1],
+    }
+    return Transfer(
+        M,
+        d0,
+        c0,
+        float(np.mean(ridge)) if stretch is not None else float(ridge),  # type: ignore[arg-type]
+        spectrum.values,
+        float(largest / max(S[rank - 1], 1e-300)) if rank else 0.0,
+        rank,
+        float(np.sqrt(weight @ squares / weight.sum())),
+        path,
+        tuple(name for name, holds in remarks.items() if holds),
+    )
 
 
-@partial(jax.jit, static_argnames="intercept")
-def _solve(
-    measured: Array, coefficients: Array, weight: Array, stretch: Array, given: Array, intercept: bool
-) -> tuple[Array, ...]:
-    """One SVD, the whole leave-one-out path, and M at the ridge that is given (or, below 0, the best of the path)."""
-    X, C = measured.astype(jnp.float64), coefficients.astype(jnp.float64)
-    offset = jnp.mean(X, 0) if intercept else jnp.zeros(X.shape[1])
-    start = jnp.mean(C, 0) if intercept else jnp.zeros(C.shape[1])
-    Q, S, Pt = jnp.linalg.svd((X - offset) * stretch, full_matrices=False)
-    C = C - start
-    QtC = jnp.matmul(Q.T, C, precision="highest")
-    grid = jnp.concatenate([jnp.zeros(1), jnp.logspace(-13, 1, _RIDGES)]) * jnp.maximum(S[0] ** 2, 1e-300)
-    path = jax.lax.map(lambda ridge: _leave_one_out(Q, S, QtC, C, weight, ridge, intercept), grid)
-    chosen = jnp.where(given < 0, grid[jnp.argmin(path)], given)
-    matrix = jnp.matmul(QtC.T * _shrink(S, chosen), Pt, precision="highest") * stretch
-    loo = _leave_one_out(Q, S, QtC, C, weight, chosen, intercept)
-    M, d0, c0 = (part.astype(jnp.float32) for part in (matrix, offset, start))
-    return M, d0, c0, S, chosen, loo, jnp.stack([grid, path], 1)
+def point_stretch(ridge: float | int | tuple[float, ...] | str, points: int) -> Float[np.ndarray, " points"] | None:
+    """Factors of the measurements under which a ridge of 1 weighs each point as asked; None where all are weighed alike.
 
-
-def _per_point(ridge: float | tuple[float, ...] | str, points: int) -> np.ndarray | None:
+    Raises:
+      UserError: see `fit_transfer`.
+    """
     if not isinstance(ridge, tuple):
         return None
     if len(ridge) != points:
         raise UserError(f"fit.ridge: got {len(ridge)} values, expected one per measurement ({points}), a number or auto")
-    if min(ridge) <= 0:
-        raise UserError(f"fit.ridge: got {min(ridge):g} for a point, expected all above 0; use 0 alone for the pseudo-inverse")
-    return np.array(ridge)
+    wrong = [value for value in ridge if not 0 < value < np.inf]
+    if wrong:
+        raise UserError(f"fit.ridge: got {wrong[0]:g} for a point, expected all above 0; use 0 alone for the pseudo-inverse")
+    return 1 / np.sqrt(np.array(ridge, np.float64))
 
 
-def _shrink(S: Array, ridge: Array) -> Array:
-    """S / (S² + ridge), where directions without signal get 0: at ridge 0 this is the pseudo-inverse."""
-    held = RANK_CUT * S[0] < S
-    return jnp.where(held | (ridge > 0), S / jnp.where(S**2 + ridge > 0, S**2 + ridge, 1), 0)
-
-
-def _leave_one_out(Q: Array, S: Array, QtC: Array, C: Array, weight: Array, ridge: Array, intercept: bool) -> Array:
-    """Weighted root mean square of e_k = (c_k - fitted_k) / (1 - h_kk)."""
-    keep = S * _shrink(S, ridge)
-    free = 1 - jnp.matmul(Q**2, keep, precision="highest") - (1 / len(C) if intercept else 0)
-    error = C - jnp.matmul(Q * keep, QtC, precision="highest")
-    # A row that alone decides its own fit (h = 1) says nothing about new ones: its error is its whole size.
-    left_out = jnp.where(free[:, None] > 1e-9, error / jnp.where(free > 1e-9, free, 1)[:, None], C)
-    return jnp.sqrt(jnp.sum(weight[:, None] * left_out**2) / jnp.sum(weight))
-
-
-def _status(
-    largest: float, rank: int, bases: int, condition: float, ridge: float
-) -> Literal["ok", "rank_deficient", "ill_conditioned", "no_signal"]:
-    if rank == 0:
-        return "no_signal"
-    if rank < bases:
-        return "rank_deficient"
-    held = ridge > (largest / ILL_CONDITIONED) ** 2
-    return "ill_conditioned" if condition > ILL_CONDITIONED and not held else "ok"
+def _answering_nothing(spectrum: Spectrum) -> np.ndarray:
+    """Squared error of each row left out under an endless ridge."""
+    return left_out(spectrum, np.array([_ENDLESS * max(spectrum.largest**2, 1e-300)]))[0][0]

@@ -66,8 +66,8 @@ class SpotLight(LightModel):
         out = out or Illumination.at(points)
         out.colour[:] = self.intensity
         _point(columns(points), place(self.position, points), out.direction.T, out.distance, out.strength)
-        inner, outer = np.cos(np.deg2rad([self.inner_deg, self.outer_deg]))
-        _within_cone(unit(np.array(self.direction)), outer, max(inner - outer, 1e-6), out.direction.T, out.strength)
+        inner, outer = 2 * np.sin(np.deg2rad([self.inner_deg, self.outer_deg]) / 2) ** 2
+        _within_cone(unit(np.array(self.direction)), outer, max(outer - inner, 1e-300), out.direction.T, out.strength)
         return out
 
     def translated(self, offset: Float[np.ndarray, "3"]) -> "SpotLight":
@@ -96,8 +96,12 @@ def _point(points: np.ndarray, position: np.ndarray, direction: np.ndarray, dist
 
 @compiled
 def _within_cone(axis: np.ndarray, outer: float, width: float, direction: np.ndarray, strength: np.ndarray) -> None:
-    """Takes away what a spot withholds: `outer` and `width` are the rim's cosine and the way from there to full light's."""
+    """Takes away what a spot withholds: `outer` is 1 - cosine at the rim, `width` the way from full light's to there.
+
+    1 - cosine is half the squared distance of the two unit vectors: in a narrow cone the cosine itself would be all rounding.
+    """
     for i in range(len(strength)):
-        cosine = -(direction[0, i] * axis[0] + direction[1, i] * axis[1] + direction[2, i] * axis[2])
-        falloff = min(max((cosine - outer) / width, 0.0), 1.0)
+        x, y, z = direction[0, i] + axis[0], direction[1, i] + axis[1], direction[2, i] + axis[2]
+        drop = 0.5 * (x * x + y * y + z * z)
+        falloff = min(max((outer - drop) / width, 0.0), 1.0)
         strength[i] *= falloff * falloff

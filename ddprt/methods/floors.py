@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ddprt.methods.method import Examples, FitReport, Frame, Method, array_bytes, as_pytree
+from ddprt.methods.method import Examples, FitReport, Frame, Method, array_bytes, as_pytree, found_in
 
 
 @as_pytree
@@ -42,7 +42,7 @@ class MeanLightmap(Method):
     def fit(self, train: Examples, validation: Examples, *, key: Array) -> MeanMap:
         """See `Method`."""
         mean = _weighted_mean(train.scale, train.indirect)
-        return MeanMap(mean, FitReport("ok" if bool((train.scale > 0).any()) else "no_signal"))
+        return MeanMap(mean, FitReport().noting(*found_in(train)))
 
 
 @jax.jit
@@ -88,6 +88,4 @@ class NearestLighting(Method):
 
     def fit(self, train: Examples, validation: Examples, *, key: Array) -> NearestMaps:
         """See `Method`."""
-        return NearestMaps(
-            train.frame.values, train.indirect, FitReport("ok" if bool((train.scale > 0).any()) else "no_signal")
-        )
+        return NearestMaps(train.frame.values, train.indirect, FitReport().noting(*found_in(train)))

@@ -6,11 +6,11 @@ dataclass of arrays, registered as a pytree, that answers `predict(frame)`. Ligh
 
 Laws, tested for every entry of `METHODS` (tests/test_methods.py): batch equals loop, save equals load, no second compile
 for equal shapes, no NaN for a dark lighting, twice the light is twice the result, and on its own validation set better than
-the mean lightmap or `FitReport.status` says so.
+the mean lightmap or `FitReport.status` says so. What statuses there are, and what each asks for: `STATUSES`.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import jax
@@ -19,18 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from pydantic import BaseModel, ConfigDict
 
-STATUSES = {
-    "ok": "Nothing to remark.",
-    "rank_deficient": "The data has fewer independent directions than were asked for, so fewer bases (or measurements) are in "
-    "use. Likely causes: few or similar lightings, points that see the same light. More varied lightings help.",
-    "ill_conditioned": "Some measurements nearly repeat each other and no ridge holds them back, so rounding is amplified. "
-    'Use ridge = "auto" or points further apart.',
-    "no_signal": "Nothing was measured or no indirect light exists; the result is black. Check that lamps reach the scene and "
-    "that its surfaces face each other.",
-    "diverged": "Training met numbers that are not finite; the weights from before are kept. Lower the learning rate.",
-    "worse_than_mean": "On the validation lightings this method does worse than the mean lightmap. More training lightings or "
-    "steps may help; do not ship it.",
-}
+from ddprt.methods.statuses import BLIND, NOTES, STATUSES, worst_first  # noqa: F401  (STATUSES is part of the contract)
 
 
 @dataclass(frozen=True)
@@ -60,6 +49,7 @@ class Examples:
       area: of the texels, m².
       weights: share of each texel in errors, summing to 1.
       channels: "mono" or "multi": whether colours are separate columns.
+      unseen: share of the indirect light's squares that lies in lightings no point sees; encoding makes them black.
     """
 
     frame: Frame
@@ -68,11 +58,26 @@ class Examples:
     area: Float[np.ndarray, " texels"]
     weights: str = "area"
     channels: str = "mono"
+    unseen: float = 0.0
 
 
 @dataclass(frozen=True)
 class FitReport:
-    """What a fit says about itself; per-channel values have one entry per transfer matrix (3 for mono, 1 for multi)."""
+    """What a fit says about itself; per-channel values have one entry per transfer matrix (3 for mono, 1 for multi).
+
+    Attributes:
+      status: the worst entry of `STATUSES` that holds, "ok" where none does or only `NOTES` do.
+      remarks: all that hold, the worst first.
+      bases: vectors in use, the mean counted in.
+      numerical_rank: of the indirect light.
+      condition, ranks: of the measurements.
+      ridge, ridge_chosen_by: in use, and whether "given" or by leave-one-out ("loo").
+      ridge_second: what generalised cross-validation would have chosen; empty where the ridge was given.
+      leave_one_out: leave-one-out error of the coefficients at the ridge in use.
+      singular_values: of the indirect light.
+      ridge_path: (ridge, leave-one-out error) of each matrix.
+      loss: (step, training loss, validation loss) of learned methods.
+    """
 
     status: str = "ok"
     bases: int = 0
@@ -83,6 +88,15 @@ class FitReport:
     singular_values: tuple[float, ...] = ()
     ridge_path: tuple[tuple[tuple[float, float], ...], ...] = ()
     loss: tuple[tuple[int, float, float], ...] = ()
+    remarks: tuple[str, ...] = ()
+    ranks: tuple[int, ...] = ()
+    ridge_second: tuple[float, ...] = ()
+    leave_one_out: tuple[float, ...] = ()
+
+    def noting(self, *names: str) -> "FitReport":
+        """The same with further statuses; the worst of all leads, whatever the order they were found in."""
+        remarks = worst_first({self.status, *self.remarks, *names})
+        return replace(self, status=next((name for name in remarks if name not in NOTES), "ok"), remarks=remarks)
 
 
 @runtime_checkable
@@ -157,3 +171,17 @@ def measurements(examples: Examples) -> Float[Array, "groups lightings inputs"]:
     """Measured values per transfer matrix: one group per channel for mono, one of interleaved colours for multi."""
     values = examples.frame.values
     return jnp.moveaxis(values, 2, 0) if examples.channels == "mono" else values.reshape(1, len(values), -1)
+
+
+def unseen_share(scale: Float[np.ndarray, "lightings 3"], indirect: Float[np.ndarray, "lightings texels 3"]) -> float:
+    """Share of the indirect light's squares in lightings and channels that no point sees, before encoding makes them black."""
+    squares = np.einsum("ltc,ltc->lc", indirect, indirect, dtype=np.float64)
+    total = float(squares.sum())
+    return float(squares[np.asarray(scale) == 0].sum()) / total if total > 0 else 0.0
+
+
+def found_in(examples: Examples) -> set[str]:
+    """Statuses that the data alone calls for, whatever is learned from it."""
+    dark = not bool((examples.scale > 0).any())
+    black = not bool((examples.indirect != 0).any())
+    return {name for name, holds in (("no_signal", dark or black), ("blind", examples.unseen > BLIND)) if holds}

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from pydantic import Field
 
 from ddprt.fitting.basis import entry_weights, fit_basis
-from ddprt.methods.method import Examples, FitReport, Frame, Method, array_bytes, as_pytree, columns, static
+from ddprt.methods.method import Examples, FitReport, Frame, Method, array_bytes, as_pytree, columns, found_in, static
 
 Layers = tuple[tuple[Float[Array, "_ _"], Float[Array, " _"]], ...]
 
@@ -73,18 +73,17 @@ class Mlp(Method):
         if basis.rank == 0:
             inputs = groups + train.frame.values.shape[1] * (3 // groups)
             dark = ((jnp.zeros((inputs, 0)),), (jnp.zeros(0),), basis.vectors, jnp.zeros(0))
-            return Perceptron(*dark, groups, FitReport(status="no_signal"))
+            return Perceptron(*dark, groups, FitReport().noting(*found_in(train), "no_signal"))
         data = tuple((e.frame.values, e.indirect, e.scale) for e in (train, validation))
         layers, spread, losses = _train(self, groups, *data, basis.vectors, entries, key)
         history = tuple((int(i + 1) * self.check_every, float(a), float(b)) for i, (a, b) in enumerate(np.asarray(losses)))
         finite = all(np.isfinite(row).all() for row in history)
         report = FitReport(
-            status=basis.status if finite else "diverged",
             bases=len(spread),
             numerical_rank=basis.rank,
             singular_values=tuple(np.asarray(basis.singular_values).tolist()),
             loss=history,
-        )
+        ).noting(*found_in(train), basis.status, *(() if finite else ("diverged",)))
         weights, biases = zip(*layers, strict=True)
         return Perceptron(weights, biases, basis.vectors, spread, groups, report)
 
@@ -134,9 +133,11 @@ def _train(
 ) -> tuple[Layers, Array, Array]:
     """All of training as one compiled loop: the best layers, the spread of coefficients, and losses per round."""
     inputs, targets, importance = _pairs(groups, train, vectors, entries)
-    spread = jnp.maximum(jnp.sqrt(jnp.mean(targets**2, (0, 1))), 1e-12)
+    peak = jnp.maximum(jnp.max(jnp.abs(targets), (0, 1)), 1e-12)
+    spread = jnp.maximum(peak * jnp.sqrt(jnp.mean((targets / peak) ** 2, (0, 1))), 1e-12)
     checked, wanted, checked_importance = _pairs(groups, validation, vectors, entries)
-    share = spread**2 / jnp.sum(spread**2)
+    relative = spread / jnp.max(spread)  # of lightings that hardly any point sees, squares could pass the range of float32
+    share = relative**2 / jnp.sum(relative**2)
     optimiser = method.optimiser()
 
     def loss(layers: Layers, inputs: Array, targets: Array, importance: Array) -> Array:
@@ -151,7 +152,7 @@ def _train(
         state, best, lowest = carry
         state, _ = jax.lax.scan(step, state, None, length=min(method.check_every, method.steps))
         now = loss(state[0], checked, wanted, checked_importance)
-        better = now < lowest
+        better = now < lowest  # never of NaN: weights that are not finite are not kept
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), state[0], best)
         return (state, best, jnp.where(better, now, lowest)), jnp.stack([loss(state[0], inputs, targets, importance), now])
 

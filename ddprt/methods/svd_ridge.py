@@ -1,19 +1,27 @@
 """The baseline: an SVD basis and a ridge-regularised linear transfer (Belcour et al., HPG 2022).
 
 Linear, closed-form and small: the reference point that learned methods must beat.
+
+A smooth ridge weighs M K^-1 M^T instead of M M^T, where K says how alike two points are expected to act. With a root R of
+K = R R^T that is the plain ridge on M' = M K^-1 R for measurements X R, so that the path of ridges and leaving one lighting
+out hold as they stand; M = M' R^T has the size of the plain one.
 """
 
 from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar, Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from pydantic import Field
+from scipy.spatial.distance import cdist
 
+from ddprt.errors import UserError
 from ddprt.fitting.basis import entry_weights, fit_basis
-from ddprt.fitting.transfer import Transfer, fit_transfer
-from ddprt.methods.method import Examples, FitReport, Frame, Method, array_bytes, as_pytree, columns, measurements
+from ddprt.fitting.selection import Spectrum, choose_ridge, decompose
+from ddprt.fitting.transfer import point_stretch, solve_transfer
+from ddprt.methods.method import Examples, FitReport, Frame, Method, array_bytes, as_pytree, columns, found_in, measurements
 
 
 @as_pytree
@@ -59,51 +67,64 @@ class LinearTransfer:
 
 
 class SvdRidge(Method):
-    """SVD basis, ridge transfer."""
+    """SVD basis, ridge transfer; all channels share one ridge."""
 
     relighter: ClassVar[type] = LinearTransfer
     why: ClassVar[str] = "the paper's baseline: closed form, linear, the reference point"
     bases: int = Field(16, ge=1)
     centre: Literal["none", "mean"] = "none"
     ridge: Literal["auto"] | Annotated[float, Field(ge=0)] | tuple[Annotated[float, Field(ge=0)], ...] = "auto"
+    smooth: float = Field(0, ge=0, description="reach over which points act alike, in distances between points; 0: off")
 
     def fit(self, train: Examples, validation: Examples, *, key: Array) -> LinearTransfer:
-        """See `Method`; neither `validation` nor `key` is used."""
+        """See `Method`; neither `validation` nor `key` is used.
+
+        Raises:
+          UserError: a ridge per measurement that is not one per measurement and above 0, or that is to be smooth.
+        """
+        if self.smooth and isinstance(self.ridge, tuple):
+            raise UserError(
+                f"fit.ridge: got a ridge per measurement with smooth = {self.smooth:g}; give one number or auto, or smooth = 0"
+            )
         rows, _ = columns(train)
         entries = jnp.asarray(entry_weights(train.area, train.weights, train.channels))  # type: ignore[arg-type]
         centre = self.centre == "mean"
         basis = fit_basis(rows, entries, bases=max(self.bases - centre, 1), centre=centre)
         per_group = _spread(basis.coefficients, train, basis.vectors.shape[0])
-        transfers: list[Transfer | None] = []
-        for group, inputs in enumerate(np.asarray(measurements(train))):
-            scale = np.asarray(train.scale[:, group])
-            lit = np.flatnonzero(scale > 0)
-            if len(lit) == 0:
-                transfers.append(None)
-                continue
-            transfers.append(
-                fit_transfer(
-                    jnp.asarray(inputs[lit]),
-                    jnp.asarray(per_group[group][lit]),
-                    ridge=self.ridge,
-                    importance=jnp.asarray((scale[lit] / scale.max()) ** 2),  # relative: squares do not overflow
-                    intercept=centre,
-                )
-            )
-        shape = (basis.vectors.shape[0], measurements(train).shape[2])
-        stack = lambda pick, size: jnp.stack([jnp.zeros(size) if t is None else pick(t) for t in transfers])  # noqa: E731
-        fitted = [t for t in transfers if t is not None]
-        worst = next((s for s in ("no_signal", "ill_conditioned", "rank_deficient") if s in {t.status for t in fitted}), "ok")
+        inputs, scale = np.asarray(measurements(train)), np.asarray(train.scale, np.float64)
+        lit = [np.flatnonzero(scale[:, group] > 0) for group in range(len(inputs))]
+        used = [group for group, rows in enumerate(lit) if len(rows)] if basis.rank else []
+        stretch = point_stretch(self.ridge, inputs.shape[2])
+        parts = [(jnp.asarray(inputs[g][lit[g]]), jnp.asarray(per_group[g][lit[g]])) for g in used]
+        if self.smooth:
+            root = likeness_root(train.frame, self.smooth)
+            root = root if train.channels == "mono" else np.kron(root, np.eye(3))
+            spectra = [_smoothed(X, C, root, intercept=centre) for X, C in parts]
+        else:
+            spectra = [decompose(X, C, stretch=stretch, intercept=centre) for X, C in parts]
+        weight = [scale[lit[g], g] ** 2 for g in used]
+        choice = choose_ridge(spectra, weight, [lit[g] for g in used]) if self.ridge == "auto" and used else None
+        ridge = choice.ridge if choice else self.ridge
+        solved = [solve_transfer(spectrum, ridge, stretch, w) for spectrum, w in zip(spectra, weight, strict=True)]  # type: ignore[arg-type]
+        fitted = dict(zip(used, solved, strict=True))
+        shape = (basis.vectors.shape[0], inputs.shape[2])
+        stack = lambda pick, size: jnp.stack(  # noqa: E731
+            [pick(fitted[g]) if g in fitted else jnp.zeros(size) for g in range(len(inputs))]
+        )
         report = FitReport(
-            status=basis.status if basis.status != "ok" else worst if fitted else "no_signal",
             bases=int(shape[0]) + centre,
             numerical_rank=basis.rank,
-            condition=tuple(t.condition for t in fitted),
-            ridge=tuple(t.ridge for t in fitted),
+            condition=tuple(t.condition for t in solved),
+            ranks=tuple(t.rank for t in solved),
+            ridge=tuple(t.ridge for t in solved),
             ridge_chosen_by="loo" if self.ridge == "auto" else "given",
+            ridge_second=(choice.second,) * len(solved) if choice else (),
+            leave_one_out=tuple(t.leave_one_out for t in solved),
             singular_values=tuple(np.asarray(basis.singular_values).tolist()),
-            ridge_path=tuple(tuple(map(tuple, np.asarray(t.path).tolist())) for t in fitted),
-        )
+            ridge_path=tuple(tuple(zip(choice.path[:, 0].tolist(), own.tolist(), strict=True)) for own in choice.own)
+            if choice
+            else ((),) * len(solved),
+        ).noting(*found_in(train), basis.status, *(r for t in solved for r in t.remarks), *(choice.remarks if choice else ()))
         return LinearTransfer(
             stack(lambda t: t.matrix, shape),
             stack(lambda t: t.offset, shape[1]),
@@ -112,6 +133,31 @@ class SvdRidge(Method):
             basis.mean,
             report,
         )
+
+
+def likeness_root(frame: Frame, smooth: float) -> Float[np.ndarray, "points points"]:
+    """A root R of K = R R^T with K_pq = exp(-|p - q| / L) max(0, n_p . n_q), less what of K is negative.
+
+    Args:
+      frame: positions and normals of the points.
+      smooth: L in units of the median distance from a point to the nearest one that lies elsewhere.
+    """
+    position, normal = np.asarray(frame.positions, np.float64), np.asarray(frame.normals, np.float64)
+    distance = cdist(position, position)
+    nearest = np.min(distance, 1, where=distance > 0, initial=np.inf)
+    apart = nearest[np.isfinite(nearest)]
+    reach = smooth * np.median(apart) if len(apart) else 1.0
+    values, vectors = np.linalg.eigh(np.exp(-distance / reach) * np.maximum(normal @ normal.T, 0))
+    return vectors * np.sqrt(np.maximum(values, 0))
+
+
+def _smoothed(X: Array, C: Array, root: np.ndarray, *, intercept: bool) -> Spectrum:
+    """The problem of X R, whose solution comes out as M = M' R^T about the mean of X."""
+    plain = np.asarray(X, np.float64)
+    with jax.enable_x64(True):
+        spectrum = decompose(jnp.asarray(plain @ root), C, intercept=intercept)
+        offset = plain.mean(0) if intercept else np.zeros(plain.shape[1])
+        return replace(spectrum, right=jnp.asarray(np.asarray(spectrum.right) @ root.T), offset=jnp.asarray(offset))
 
 
 def _spread(coefficients: Array, train: Examples, bases: int) -> list[np.ndarray]:

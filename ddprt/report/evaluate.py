@@ -8,18 +8,20 @@ from typing import Any
 import jax
 import numpy as np
 from jaxtyping import Array
+from threadpoolctl import threadpool_limits
 
 from ddprt import seeds
 from ddprt.config import Config
 from ddprt.dataset.store import Dataset
 from ddprt.fitting.basis import entry_weights
 from ddprt.fitting.encoding import Encoding
-from ddprt.report.metrics import Truth, negative_share, z_scores
+from ddprt.report.metrics import Truth, negative_share, negative_shares, z_scores
 from ddprt.runtime.model import Model
 from ddprt.runtime.train import fit_method
 from ddprt.scene.mesh import Scene
 
 _STEADY = 0.2  # standard error over brightness below which an estimate counts as near normal
+_FEWEST = 8  # lightings that a rank correlation is told of
 
 
 @dataclass
@@ -45,6 +47,7 @@ class Evaluation:
     distance: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")  # so that scores are the same bits on any number of cores
 def evaluate(data: Dataset, models: Mapping[str, Model], fit_seconds: Mapping[str, float]) -> Evaluation:
     """Scores models on a dataset's test split.
 
@@ -60,10 +63,12 @@ def evaluate(data: Dataset, models: Mapping[str, Model], fit_seconds: Mapping[st
         values = data.values(test, model.points, model.quantity)
         unclamped, relight_seconds = _frame_by_frame(model, values)
         predicted[name] = np.maximum(unclamped, 0)  # the clamp commutes with decoding, which is odd and rising
-        report = model.relighter.report
+        report, shares = model.relighter.report, negative_shares(unclamped, truth.weight)
         scores[name] = {
             **truth.scores(predicted[name]),
-            "negative_share": negative_share(unclamped, truth.weight),
+            "negative_share": _finite(negative_share(unclamped, truth.weight)),
+            "median_negative_share": _finite(float(np.median(shares))),
+            "worst_negative_share": _finite(float(shares.max(initial=0))),
             "fit_seconds": fit_seconds.get(name, 0.0),
             "relight_seconds": relight_seconds,
             "bytes": model.relighter.nbytes,
@@ -71,7 +76,7 @@ def evaluate(data: Dataset, models: Mapping[str, Model], fit_seconds: Mapping[st
             "bases": report.bases,
             "status": report.status,
         }
-    main = next(iter(models.values()))
+    lead, main = next(iter(models.items()))
     report = main.relighter.report
     metrics = {
         "schema": 1,
@@ -85,6 +90,9 @@ def evaluate(data: Dataset, models: Mapping[str, Model], fit_seconds: Mapping[st
             "projection_relative_rmse": projection_error(data, main, truth),
             "mean_relative_rmse": scores.get("mean", {}).get("relative_rmse"),
         },
+        "trust": trust_agreement(
+            main, data.values(test, main.points, main.quantity), truth.errors_per_lighting(predicted[lead])
+        ),
         "numerics": {
             "measurement_condition": [_finite(value) for value in report.condition],
             "numerical_rank": report.numerical_rank,
@@ -95,6 +103,41 @@ def evaluate(data: Dataset, models: Mapping[str, Model], fit_seconds: Mapping[st
     evaluation = Evaluation(metrics, truth, values, predicted)
     evaluation.distance = _distance_to_surface(data, main, test)
     return evaluation
+
+
+def trust_agreement(model: Model, values: np.ndarray, errors: np.ndarray) -> dict[str, Any] | None:
+    """How well trust tells the error of held-out lightings; None for models that know no trust.
+
+    Args:
+      model: whose trust.
+      values: measured light of the lightings, W/m².
+      errors: norm over norm of each; NaN where the reference is dark.
+    Returns:
+      spearman: rank correlation of expected and true error, None for fewer than 8 lightings or none that differ;
+      median_expected_error, median_error; flagged_share: of lightings called extrapolating; unseen: lightings with indirect
+      light that no point measures, which count nowhere else.
+    """
+    found = model.trust(values)
+    if found is None:
+        return None
+    seen, lit = values.any((1, 2)), np.isfinite(errors)
+    both = seen & lit
+    return {
+        "spearman": rank_correlation(-found.score[both], errors[both]) if both.sum() >= _FEWEST else None,
+        "median_expected_error": float(np.median(1 - found.score[both])) if both.any() else None,
+        "median_error": float(np.median(errors[both])) if both.any() else None,
+        "flagged_share": float(np.mean(found.extrapolating[both])) if both.any() else None,
+        "unseen": int((lit & ~seen).sum()),
+    }
+
+
+def rank_correlation(a: np.ndarray, b: np.ndarray) -> float | None:
+    """Spearman's: the correlation of ranks, ties sharing theirs; None where all of one side are equal."""
+    from scipy.stats import rankdata
+
+    a, b = rankdata(a) - (len(a) + 1) / 2, rankdata(b) - (len(b) + 1) / 2
+    size = float(np.sqrt((a @ a) * (b @ b)))
+    return float(a @ b) / size if size > 0 else None
 
 
 def projection_error(data: Dataset, model: Model, truth: Truth, bases: int | None = None) -> float | None:
@@ -149,12 +192,12 @@ def bases_curve(data: Dataset, config: Config, truth: Truth) -> list[tuple[int, 
         seed=config.seed,
     )
     values, whole = data.values(test, model.points, model.quantity), model.relighter.report.bases
-    has_mean = whole - len(model.relighter.basis)  # type: ignore[attr-defined]
+    has_mean = whole - len(model.relighter.basis)
     if whole == 0:
         return []
     rows = []
     for bases in sorted({min(bases, whole) for bases in config.report.bases_curve if bases > has_mean}):
-        shorter = replace(model, relighter=model.relighter.truncated(bases - has_mean))  # type: ignore[attr-defined]
+        shorter = replace(model, relighter=model.relighter.truncated(bases - has_mean))
         error = truth.relative_rmse(np.maximum(_frame_by_frame(shorter, values)[0], 0) - truth.reference)
         floor = projection_error(data, model, truth, bases - has_mean)
         if error is not None and floor is not None:

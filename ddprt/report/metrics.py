@@ -44,6 +44,14 @@ class Truth:
         lit = self.squares > 0
         return np.sqrt(np.divide(squares, self.squares, out=np.full_like(squares, np.nan), where=lit))
 
+    def flicker(self, predicted: Maps) -> float | None:
+        """Jitter that the prediction adds to that of the reference, over the mean of the reference; lightings are frames.
+
+        Jitter is taken of the difference, so that what moves in the reference itself does not count, and jumps of the two
+        cannot make up for each other. None where the reference is black.
+        """
+        return jitter(predicted - self.reference, self.weight) / self.mean if self.mean > 0 else None
+
     def scores(self, predicted: Maps) -> dict[str, float | None]:
         """All numbers of the method table."""
         difference = predicted - self.reference
@@ -63,11 +71,45 @@ class Truth:
         }
 
 
+def negative_shares(unclamped: Maps, weight: Float64[np.ndarray, " texels"]) -> Float64[np.ndarray, " lightings"]:
+    """Energy of negative light before the clamp as a share of the positive, of each lighting.
+
+    Returns:
+      0 for a dark map; infinity where there is nothing but negative light.
+    """
+    negative, positive = _below_and_above(unclamped, weight)
+    nothing = np.where(negative > 0, np.inf, 0.0)
+    return np.divide(negative, positive, out=nothing, where=positive > 0)
+
+
 def negative_share(unclamped: Maps, weight: Float64[np.ndarray, " texels"]) -> float:
-    """Energy of negative light before the clamp, as a share of the positive."""
-    total = np.einsum("ltc,t->", np.abs(unclamped), weight, dtype=np.float64)
-    negative = np.einsum("ltc,t->", np.maximum(-unclamped, 0), weight, dtype=np.float64)
-    return float(negative / (total - negative)) if total > negative else 0.0
+    """The same of all lightings together: the mean of theirs, each weighted by its positive energy."""
+    negative, positive = _below_and_above(unclamped, weight).sum(1)
+    return float(negative / positive) if positive > 0 else float(np.inf if negative > 0 else 0)
+
+
+def _below_and_above(unclamped: Maps, weight: Float64[np.ndarray, " texels"]) -> Float64[np.ndarray, "2 lightings"]:
+    """Area-weighted energy below and above zero, summed over channels."""
+    signs = (-1, 1)
+    return np.array([[np.einsum("tc,t->", np.maximum(sign * row, 0), weight) for row in unclamped] for sign in signs])
+
+
+def jitter(frames: Maps, weight: Float64[np.ndarray, " texels"]) -> float:
+    """How unsteady maps are along a path of small steps: RMS of their second difference in time over sqrt(6), W/m².
+
+    Light that stays or changes evenly has none, a smooth change has little (it falls with the square of the step), and a jump
+    counts in full. The factor makes noise that is independent from frame to frame read as its standard deviation.
+
+    Args:
+      frames: evenly spaced in time.
+      weight: of the texels, summing to 1.
+    Raises:
+      ValueError: fewer than three frames.
+    """
+    if len(frames) < 3:
+        raise ValueError(f"frames: got {len(frames)}, expected at least 3")
+    bends = (np.diff(frames[first : first + 3].astype(np.float64), 2, axis=0)[0] for first in range(len(frames) - 2))
+    return float(np.sqrt(np.mean([np.einsum("tc,t->", bend**2, weight) / 3 for bend in bends]) / 6))
 
 
 def z_scores(

@@ -11,7 +11,7 @@ from ddprt import __version__
 from ddprt.config import Config
 from ddprt.dataset.store import Dataset
 from ddprt.files import write_text
-from ddprt.methods.method import STATUSES
+from ddprt.methods.statuses import STATUSES
 from ddprt.report import figures
 from ddprt.report.evaluate import Evaluation
 from ddprt.report.view import View, default_camera, take_view
@@ -25,6 +25,7 @@ from ddprt.transport.embree import Tracer
 _NOISE_SHARE = 1 / 3  # noise floor over projection floor
 _MEAN_Z, _SPREAD_Z, _BIAS = 0.3, 1.5, 0.01  # of the spot check
 _NEGATIVE = 0.01  # negative energy over positive
+_OUTSIDE = 0.5  # share of held-out lightings outside of what was trained on
 _BOUND = 0.01  # light left out over the largest direct irradiance
 
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -37,6 +38,8 @@ _METHOD_KEYS = {
     "psnr_db": ("PSNR (dB)", "one"),
     "energy_bias": ("energy bias", "signed"),
     "negative_share": ("negative light", "percent"),
+    "median_negative_share": ("median", "percent"),
+    "worst_negative_share": ("worst", "percent"),
     "fit_seconds": ("fit", "seconds"),
     "relight_seconds": ("relight", "seconds"),
     "bytes": ("size", "bytes"),
@@ -127,9 +130,10 @@ def warnings(
     scores, count = metrics["methods"], metrics["dark_test_lightings"]
     noise, projection = (metrics["floors"][f"{key}_relative_rmse"] for key in ("noise", "projection"))
     found = [
-        (f"{name}: {score['status']}", STATUSES.get(score["status"], "This status has no description."))
+        (f"{name}: {remark}", STATUSES.get(remark, "This status has no description."))
         for name, score in scores.items()
-        if score["status"] != "ok"
+        for remark in score.get("remarks") or [score["status"]]
+        if remark != "ok"
     ]
     if noise is not None and projection is not None and noise > _NOISE_SHARE * projection:
         text = (
@@ -150,11 +154,17 @@ def warnings(
             "errors but have no relative error of their own. Their lamps may stand inside a solid or outside the room."
         )
         found.append(("Dark test lightings", text))
-    if scores[main]["negative_share"] > _NEGATIVE:
-        share = _percent(scores[main]["negative_share"])
-        found.append(("Negative light", f"Before the clamp, the negative part of the prediction is {share} of the positive."))
+    trust = metrics.get("trust") or {}
+    if (trust.get("flagged_share") or 0) > _OUTSIDE:
+        found.append(("Held-out lightings of another kind", STATUSES["extrapolating"]))
+    if trust.get("unseen"):
+        found.append((f"{trust['unseen']} held-out lightings that no point sees", STATUSES["blind"]))
+    share = scores[main]["negative_share"]
+    if share is None or share > _NEGATIVE:
+        much = "all there is" if share is None else f"{_percent(share)} of the positive"
+        found.append(("Negative light", f"Before the clamp, the negative part of the prediction is {much}."))
     for effect in effects:
-        if effect.forced or (not effect.called and (effect.bound is None or effect.bound > _BOUND)):
+        if effect.forced or effect.bound is None or (not effect.called and effect.bound > _BOUND):
             share = (
                 "an unbounded amount of" if effect.bound is None else f"at most {_percent(effect.bound)} of the largest direct"
             )

@@ -1,7 +1,7 @@
 """A Model: a Relighter with everything that an engine needs around it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from ddprt.errors import UserError
 from ddprt.fitting.encoding import Encoding
 from ddprt.lights import Light, Lighting, parse_lighting
 from ddprt.methods.method import Frame, Relighter
+from ddprt.runtime.trust import Trust, Yardstick
 from ddprt.sampling.points import Samples
 
 
@@ -35,6 +36,7 @@ class Model:
       occluders: triangle corners that cast shadows, metres.
       scene: name and digest of what it was trained on.
       uv: lightmap coordinates of the occluders' corners, origin top-left; None in models of older versions.
+      yardstick: what trust is measured with; None likewise.
     """
 
     method: str
@@ -48,34 +50,55 @@ class Model:
     occluders: np.ndarray
     scene: dict[str, str]
     uv: np.ndarray | None = None
+    yardstick: Yardstick | None = None
 
-    def predict(self, values: Any, *, clamp: bool = True) -> np.ndarray:
+    def predict(self, values: Any, *, clamp: bool | str = True, fade: bool = False) -> np.ndarray:
         """Indirect irradiance from measured light.
 
         Args:
           values: (points, 3) or (frames, points, 3) measured light in W/m², of `quantity`.
-          clamp: cut negative light off, as an engine does.
+          clamp: cut negative light off, as an engine does; "energy": in the way that keeps the total of each frame and channel
+            (see `ddprt.fitting.encoding.without_negatives`); False keeps it.
+          fade: where trust is low, go over to the mean lightmap, as bright as the measurements are.
         Returns:
           (texels, 3) or (frames, texels, 3) float32, W/m², covered texels in row-major order.
         Raises:
+          UserError: wrong shape, not finite, no such clamp, or nothing to fade by.
+        """
+        frames, single = self._frames(values)
+        if clamp not in (True, False, "energy"):
+            raise UserError(f'clamp: got {clamp!r}, expected True, False or "energy"')
+        if fade and self.yardstick is None:
+            raise UserError("fade: got a model of an older version, which knows no trust; fit it again")
+        area = jnp.asarray(self.area, jnp.float32) if clamp == "energy" else None
+        light = np.asarray(_relight(self.relighter, self.encoding, frames, *self._places, bool(clamp), area))
+        if fade and self.yardstick is not None:
+            kept = self.yardstick.kept(self.yardstick.measure(self.encoding, frames).score)[:, None, None]
+            mean = self.predict(self.yardstick.mean, clamp=clamp) * np.asarray(self.encoding.scale(frames))[:, None]
+            light = np.where(kept < 1, kept * light + (1 - kept) * mean, light)
+        return light[0] if single else light
+
+    def trust(self, values: Any) -> Trust | None:
+        """How far measured light lies from what the model was trained on, and what error to expect; None in older models.
+
+        Args:
+          values: as for `predict`. Lamps that no measurement point sees are not told from lamps that are off.
+        Raises:
           UserError: wrong shape, or not finite.
         """
-        measured = np.asarray(values, np.float32)
-        single = measured.ndim == 2
-        if measured.shape[-2:] != (self.points, 3) or measured.ndim not in (2, 3):
-            raise UserError(f"values: got shape {measured.shape}, expected ({self.points}, 3) or (frames, {self.points}, 3)")
-        if not np.isfinite(measured).all():
-            raise UserError("values: got NaN or infinity, expected finite W/m²; check the shading of the measurement points")
-        frames = jnp.asarray(measured[None] if single else measured)
-        light = np.asarray(_relight(self.relighter, self.encoding, frames, *self._places, clamp))
-        return light[0] if single else light
+        frames, single = self._frames(values)
+        if self.yardstick is None:
+            return None
+        found = self.yardstick.measure(self.encoding, frames)
+        return Trust(*(np.asarray(getattr(found, entry.name)[0]) for entry in fields(found))) if single else found
 
     def measure(self, lighting: Lighting | Light | Sequence[dict[str, Any]] | dict[str, Any]) -> np.ndarray:
         """(points, 3) float32: direct light at the points with shadow rays, W/m², as `predict` takes it."""
         from ddprt.transport.measure import measure
 
         parsed = parse_lighting(lighting)
-        irradiance = measure(self._tracer, parsed, self.samples.position, self.samples.normal, seed=0)
+        samples = self.samples
+        irradiance = measure(self._tracer, parsed, samples.position, samples.normal, seed=0, depth=samples.depth)
         return average_into_points(irradiance[None], self.samples, self.points, self.quantity)[0]
 
     def relight(self, lighting: Lighting | Light | Sequence[dict[str, Any]] | dict[str, Any]) -> np.ndarray:
@@ -100,6 +123,16 @@ class Model:
 
         save_model(self, Path(folder))
 
+    def _frames(self, values: Any) -> tuple[Float[Array, "frames points 3"], bool]:
+        """Measured light as frames, and whether it was a single one."""
+        measured = np.asarray(values, np.float32)
+        single = measured.ndim == 2
+        if measured.shape[-2:] != (self.points, 3) or measured.ndim not in (2, 3):
+            raise UserError(f"values: got shape {measured.shape}, expected ({self.points}, 3) or (frames, {self.points}, 3)")
+        if not np.isfinite(measured).all():
+            raise UserError("values: got NaN or infinity, expected finite W/m²; check the shading of the measurement points")
+        return jnp.asarray(measured[None] if single else measured), single
+
     @cached_property
     def _places(self) -> tuple[Array, Array]:
         return (
@@ -122,7 +155,8 @@ def _relight(
     positions: Float[Array, "points 3"],
     normals: Float[Array, "points 3"],
     clamp: bool | Array,
+    area: Float[Array, " texels"] | None,
 ) -> Float[Array, "frames texels 3"]:
     scale = encoding.scale(values)
     frame = Frame(encoding.encode(values, scale), positions, normals)
-    return encoding.decode(relighter.predict(frame), scale, clamp=clamp)
+    return encoding.decode(relighter.predict(frame), scale, clamp=clamp, energy_over=area)

@@ -15,6 +15,7 @@ from ddprt.fitting.encoding import Encoding
 from ddprt.methods import METHODS
 from ddprt.methods.method import FitReport
 from ddprt.runtime.model import Model
+from ddprt.runtime.trust import Yardstick
 from ddprt.sampling.points import Samples
 
 SCHEMA = 1
@@ -36,6 +37,14 @@ def save_model(model: Model, folder: Path) -> None:
     }
     if model.uv is not None:
         tensors["scene.uv"] = model.uv
+    trust: dict[str, float] = {}
+    if model.yardstick is not None:
+        for entry in fields(model.yardstick):
+            value = getattr(model.yardstick, entry.name)
+            if isinstance(value, np.ndarray):
+                tensors[f"trust.{entry.name}"] = value
+            else:
+                trust[entry.name] = value
     static: dict[str, Any] = {}
     for entry in fields(model.relighter):  # type: ignore[arg-type]
         value = getattr(model.relighter, entry.name)
@@ -53,10 +62,16 @@ def save_model(model: Model, folder: Path) -> None:
         "ddprt": __version__,
         "method": model.method,
         "encoding": asdict(model.encoding),
-        "points": {"count": model.points, "quantity": model.quantity, "spacing": model.samples.spacing},
+        "points": {
+            "count": model.points,
+            "quantity": model.quantity,
+            "spacing": model.samples.spacing,
+            "depth": model.samples.depth,
+        },
         "scene": model.scene,
         "relighter": static,
         "report": asdict(model.relighter.report),
+        "trust": trust or None,
         "unit": "W/m2",
     }
     write_tensors(folder / "tensors.safetensors", tensors)
@@ -84,6 +99,7 @@ def load_model(folder: str | Path) -> Model:
         relighter_type = METHODS[document["method"]].relighter
         model = _assemble(document, tensors, relighter_type)
         model.predict(np.zeros((model.points, 3)))
+        model.trust(np.zeros((model.points, 3)))
     except UserError:
         raise
     except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -115,7 +131,8 @@ def _assemble(document: dict[str, Any], tensors: dict[str, np.ndarray], relighte
     uv = tensors.get("scene.uv")
     if uv is not None and uv.shape != (len(tensors["scene.corners"]), 3, 2):
         raise ValueError(f"got lightmap coordinates of shape {uv.shape}")
-    samples = Samples(tensors["points.position"], tensors["points.normal"], tensors["points.albedo"], places["spacing"])
+    position, normal, albedo = (tensors[f"points.{name}"] for name in ("position", "normal", "albedo"))
+    samples = Samples(position, normal, albedo, places["spacing"], places.get("depth", 0.0))
     return Model(
         document["method"],
         relighter_type(**arguments),
@@ -128,7 +145,13 @@ def _assemble(document: dict[str, Any], tensors: dict[str, np.ndarray], relighte
         tensors["scene.corners"],
         document["scene"],
         uv,
+        None if document.get("trust") is None else _yardstick(document["trust"], tensors),
     )
+
+
+def _yardstick(numbers: dict[str, float], tensors: dict[str, np.ndarray]) -> Yardstick:
+    directions, shares, mean = (tensors[f"trust.{name}"] for name in ("directions", "shares", "mean"))
+    return Yardstick(directions, shares, mean, **{name: float(value) for name, value in numbers.items()})
 
 
 def _tuples(value: Any) -> Any:

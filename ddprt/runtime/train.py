@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
+from threadpoolctl import threadpool_limits
 
 from ddprt import seeds
 from ddprt.config import Config, FitConfig
@@ -18,8 +19,9 @@ from ddprt.fitting.encoding import Encoding
 from ddprt.lights import Lighting
 from ddprt.methods import make_method
 from ddprt.methods.floors import MeanLightmap
-from ddprt.methods.method import Examples, Frame, Relighter
+from ddprt.methods.method import Examples, Frame, Relighter, unseen_share
 from ddprt.runtime.model import Model
+from ddprt.runtime.trust import Yardstick, calibrated, make_yardstick, outside
 
 
 def fit(
@@ -65,6 +67,7 @@ def fit(
     return fit_method(data, config, method, settings or {}, points=points, quantity=quantity, seed=seed)
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")  # the last bits of LAPACK's factors depend on how many threads it has
 def fit_method(
     data: Dataset,
     config: FitConfig,
@@ -83,7 +86,7 @@ def fit_method(
     encoding = Encoding(config.space, config.gamma, config.channels)
     train, validation = (examples(data, split, encoding, config, points, quantity) for split in ("train", "validation"))
     relighter = method.fit(train, validation, key=jax.random.key(seeds.number(seed, f"method {name}")))
-    relighter = _judged(relighter, encoding, train, validation)
+    relighter, yardstick = _judged(relighter, encoding, train, validation)
     return Model(
         name,
         relighter,
@@ -96,25 +99,36 @@ def fit_method(
         data.occluders,
         {key: data.description["scene"][key] for key in ("name", "digest")},
         data.uv,
+        yardstick,
     )
 
 
-def _judged(relighter: Relighter, encoding: Encoding, train: Examples, validation: Examples) -> Relighter:
-    """The law that a method beats the mean lightmap on its validation set, or says that it does not."""
+def _judged(relighter: Relighter, encoding: Encoding, train: Examples, validation: Examples) -> tuple[Relighter, Yardstick]:
+    """The laws that a method beats the mean lightmap on its validation set and was trained on its kind, or says that not."""
     mean = MeanLightmap().fit(train, validation, key=jax.random.key(0))
     frame = validation.frame
     area = jnp.asarray(validation.area / validation.area.sum(), jnp.float32)
     data = frame.values, frame.positions, frame.normals, validation.indirect, validation.scale, area
     lightings = None if frame.lightings is None else tuple(frame.lightings)
-    if relighter.report.status != "ok" or float(_squared_error(relighter, encoding, *data, lightings)) <= float(
-        _squared_error(mean, encoding, *data, lightings)
-    ):
-        return relighter
-    return replace(relighter, report=replace(relighter.report, status="worse_than_mean"))  # type: ignore[type-var]
+    ours, floor, whole = (
+        np.asarray(part, np.float64)
+        for part in (*(_squares(one, encoding, *data, lightings) for one in (relighter, mean)), _energy(encoding, *data[3:]))
+    )
+    yardstick = make_yardstick(train, encoding)
+    novelty = yardstick.novelty(frame.values, validation.scale)
+    lit = whole > 0
+    of_ours, of_mean = (np.sqrt(np.divide(part, whole, out=np.full_like(whole, np.nan), where=lit)) for part in (ours, floor))
+    yardstick = calibrated(yardstick, novelty, of_ours, of_mean)
+    report = relighter.report
+    if not ours.sum() <= floor.sum():
+        report = report.noting("worse_than_mean")
+    if outside(yardstick, novelty[np.asarray(validation.scale).max(1) > 0]):
+        report = report.noting("extrapolating")
+    return replace(relighter, report=report), yardstick  # type: ignore[type-var]
 
 
 @partial(jax.jit, static_argnames="lightings")
-def _squared_error(
+def _squares(
     relighter: Relighter,
     encoding: Encoding,
     values: Array,
@@ -125,22 +139,36 @@ def _squared_error(
     area: Array,
     lightings: tuple[Lighting, ...] | None,
 ) -> Array:
+    """Area-weighted squared error of each lighting, relative to the brightest one so that no square overflows."""
     light = relighter.predict(Frame(values, positions, normals, lightings))
-    difference = encoding.decode(light, scale) - encoding.decode(indirect, scale)
-    return jnp.einsum("ltc,t->", difference**2, area)
+    relative = _relative(scale)
+    difference = encoding.decode(light, relative) - encoding.decode(indirect, relative)
+    return jnp.einsum("ltc,t->l", difference**2, area)
+
+
+@jax.jit
+def _energy(encoding: Encoding, indirect: Array, scale: Array, area: Array) -> Array:
+    """Area-weighted square of the light of each lighting, in the same units."""
+    return jnp.einsum("ltc,t->l", encoding.decode(indirect, _relative(scale)) ** 2, area)
+
+
+def _relative(scale: Array) -> Array:
+    return scale / jnp.maximum(jnp.max(scale), jnp.finfo(jnp.float32).tiny)
 
 
 def examples(data: Dataset, split: str, encoding: Encoding, config: FitConfig, points: int, quantity: str) -> Examples:
     """Scaled and encoded pairs of a split: here arrays pass from NumPy to JAX."""
     indices = data.split(split)
-    values, scale, indirect = _encoded(encoding, data.values(indices, points, quantity), data.maps("indirect", indices))
+    light = data.maps("indirect", indices)
+    values, scale, indirect = _encoded(encoding, data.values(indices, points, quantity), light)
     frame = Frame(
         values,
         jnp.asarray(data.samples.position[:points], jnp.float32),
         jnp.asarray(data.samples.normal[:points], jnp.float32),
         [data.lightings[index] for index in indices],
     )
-    return Examples(frame, indirect, scale, np.asarray(data.area, np.float32), config.weights, config.channels)
+    unseen = unseen_share(np.asarray(scale), light)
+    return Examples(frame, indirect, scale, np.asarray(data.area, np.float32), config.weights, config.channels, unseen)
 
 
 @jax.jit

@@ -15,8 +15,11 @@ import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
 
 from ddprt import seeds, warp
-from ddprt.axes import Float, Float64, Int
+from ddprt.axes import Bool, Float, Float64, Int
 from ddprt.errors import UserError
+from ddprt.lights.light import unit
+from ddprt.scene.atlas import SHUT, Atlas
+from ddprt.scene.checks import FARTHEST
 from ddprt.scene.mesh import Scene
 
 _DENSITY = 5  # candidates per sample kept, as the paper advises
@@ -32,12 +35,14 @@ class Samples:
       normal: unit, geometric.
       albedo: linear.
       spacing: metres; typical distance between neighbours, to weigh position against orientation.
+      depth: metres behind the surface that light is evaluated at, see `transport.measure`; 0 on it.
     """
 
     position: Float64[np.ndarray, "samples 3"]
     normal: Float64[np.ndarray, "samples 3"]
     albedo: Float64[np.ndarray, "samples 3"]
     spacing: float
+    depth: float = 0.0
 
     @property
     def digest(self) -> str:
@@ -45,6 +50,8 @@ class Samples:
         state = hashlib.sha256()
         for array in (self.position, self.normal, self.albedo):
             state.update(np.ascontiguousarray(array).tobytes())
+        if self.depth:
+            state.update(np.float64(self.depth).tobytes())
         return state.hexdigest()[:16]
 
     def nearest_point(self, points: int) -> Int[np.ndarray, " samples"]:
@@ -54,10 +61,12 @@ class Samples:
         """
         spread = self.spacing * np.sqrt(len(self.position) / points)
         places = np.concatenate([self.position / spread, self.normal / np.sqrt(2)], 1)
-        return cKDTree(places[:points]).query(places)[1]
+        home = cKDTree(places[:points]).query(places)[1]
+        home[:points] = np.arange(points)  # of points at one place each keeps its own light
+        return home
 
 
-def place_samples(scene: Scene, count: int, *, on: str, seed: int) -> Samples:
+def place_samples(scene: Scene, count: int, *, on: str, seed: int, atlas: Atlas | None = None) -> Samples:
     """Blue-noise samples on the surface or on the convex hull.
 
     Args:
@@ -65,30 +74,56 @@ def place_samples(scene: Scene, count: int, *, on: str, seed: int) -> Samples:
       count: samples, that is points times supersampling.
       on: "surface" or "hull" (hull samples have the albedo of the nearest surface).
       seed: of the run.
+      atlas: of what is in the open, which samples on the surface keep to; None takes the whole of it.
     Raises:
-      UserError: the hull is flat.
+      UserError: the hull is flat, or next to nothing is in the open.
     """
     rng = seeds.stream(seed, "points")
-    candidates = _DENSITY * count
     if on == "hull":
         corners, normals = _hull(scene)
     else:
         corners, normals = scene.corners, scene.geometric_normals
     areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    area, within = float(areas.sum()), atlas if on == "surface" else None
+    candidates = round(_DENSITY * count * (area / within.area.sum() if within else 1))
     # One stratum per candidate: areas are met far better than by independent draws.
-    strata = (np.arange(candidates) + rng.random(candidates)) / candidates * areas.sum()
+    strata = (np.arange(candidates) + rng.random(candidates)) / candidates * area
     triangle = np.minimum(np.searchsorted(np.cumsum(areas), strata, side="right"), len(areas) - 1)
     weights = warp.sample_triangle(rng.random((candidates, 2)))
     weights = np.stack([1 - weights.sum(1), weights[:, 0], weights[:, 1]], 1)
+    if within:
+        is_open = _in_the_open(within, triangle, weights)
+        if not is_open.all():
+            triangle, weights, area = triangle[is_open], weights[is_open], float(within.area.sum())
+        if len(triangle) < count:
+            raise UserError(
+                f'points.count: got {count} samples to place, but {len(triangle)} of {candidates} candidates on "{scene.name}" '
+                "are in the open; lower points.count or points.supersample, or take out what lies inside solids"
+            )
     position = np.einsum("nc,ncd->nd", weights, corners[triangle])
-    order = eliminate(position, count, float(areas.sum()))
+    order = eliminate(position, count, area)
     position, triangle, weights = position[order], triangle[order], weights[order]
     if on == "hull":
         nearest = cKDTree(scene.corners.mean(1)).query(position)[1]
         albedo = scene.albedo_at(nearest, np.full((count, 3), 1 / 3))
     else:
         albedo = scene.albedo_at(triangle, weights)
-    return Samples(position, normals[triangle], albedo, float(np.sqrt(areas.sum() / count)))
+    return Samples(position, normals[triangle], albedo, float(np.sqrt(area / count)))
+
+
+def _in_the_open(atlas: Atlas, triangle: Int[np.ndarray, " n"], weights: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Which places on a scene its atlas of the open does not leave out, to a small square of a texel."""
+    place = np.einsum("nc,ncd->nd", weights, atlas.uv[triangle]) * atlas.resolution
+    column, row = np.clip(place.astype(int), 0, atlas.resolution - 1).T
+    slot = atlas.slot[row, column]
+    of_texel = np.full(atlas.count, -1)
+    of_texel[atlas.parted] = np.arange(len(atlas.parted))
+    parted = np.flatnonzero((slot >= 0) & (of_texel[slot] >= 0))
+    squares = atlas.part.shape[1]
+    across, down = np.clip((place[parted] - np.stack([column, row], 1)[parted]) * squares, 0, squares - 1).astype(int).T
+    is_open = slot != SHUT  # nothing is known of what rounding moves off its chart
+    is_open[parted] = atlas.part[of_texel[slot[parted]], down, across] >= 0
+    return is_open
 
 
 def load_samples(path: str | Path) -> Samples:
@@ -109,13 +144,16 @@ def load_samples(path: str | Path) -> Samples:
         raise UserError(
             f'points.file {path}: not a JSON list of {{"position", "normal", "albedo"}} with three numbers each ({error})'
         ) from None
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    if not np.isfinite([position, normal, albedo]).all() or not (length > 0).all():
+    largest = np.abs(normal).max(1, keepdims=True)
+    if not np.isfinite([position, normal, albedo]).all() or not (largest > 0).all():
         raise UserError(f"points.file {path}: got a number that is not finite or a normal of length 0; mend the file")
+    if (np.abs(position) >= FARTHEST).any():
+        raise UserError(f"points.file {path}: got a position past {FARTHEST:g} m; mend the file")
+    normal /= largest  # so that no square overflows
     if (albedo < 0).any() or (albedo > 1).any():
         raise UserError(f"points.file {path}: got albedo {albedo.min():g} to {albedo.max():g}, expected 0 to 1; mend the file")
     extent = float(np.ptp(position, axis=0).max()) or 1.0
-    return Samples(position, normal / length, albedo, extent / np.sqrt(len(position)))
+    return Samples(position, unit(normal), albedo, extent / np.sqrt(len(position)))
 
 
 def eliminate(position: Float[np.ndarray, "n 3"], keep: int, area: float) -> Int[np.ndarray, " keep"]:

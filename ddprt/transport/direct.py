@@ -62,7 +62,7 @@ def on_texels(tracer: Tracer, atlas: Atlas, samples: int, rng: np.random.Generat
 
 
 def mean_irradiance(
-    tracer: Tracer, lighting: Lighting, places: Places, rng: np.random.Generator
+    tracer: Tracer, lighting: Lighting, places: Places, rng: np.random.Generator, *, shadows: bool = True
 ) -> Float32[np.ndarray, "groups 3"]:
     """Mean E of each group of points, shadows included, with one ray from every point to every light.
 
@@ -74,13 +74,14 @@ def mean_irradiance(
       lighting: lights in the tracer's centred frame (see `centred`).
       places: where.
       rng: for lights with size.
+      shadows: False lets light through everything, and traces no ray.
     Returns:
       W/m². What is too much for float32 becomes infinity or NaN, and is refused where light is stored.
     """
     total = np.zeros((places.count, 3), np.float32)
     for light in lighting:
         words = rng.integers(0, 1 << 64, 0 if light.delta else places.count, np.uint64).view(np.uint32).reshape(-1, 2)
-        _add(tracer, light, places, partial(_shifted, words, _sequence(places.samples)), total)
+        _add(tracer, light, places, partial(_shifted, words, _sequence(places.samples)), total, shadows)
     return total
 
 
@@ -114,7 +115,9 @@ def centred(tracer: Tracer, lighting: Lighting) -> Lighting:
     return tuple(light.translated(-tracer.centre) for light in lighting)
 
 
-def _add(tracer: Tracer, light: Light, places: Places, numbers: Numbers, total: Float32[np.ndarray, "groups 3"]) -> None:
+def _add(
+    tracer: Tracer, light: Light, places: Places, numbers: Numbers, total: Float32[np.ndarray, "groups 3"], shadows: bool = True
+) -> None:
     """Adds a light's share to the means."""
     size, samples = places.blocks.shape[2], places.samples
     u = np.zeros((2, size), np.float32)
@@ -129,7 +132,7 @@ def _add(tracer: Tracer, light: Light, places: Places, numbers: Numbers, total: 
         light_there = sample.direction.T, sample.distance, sample.strength
         rays = _aim(block, *light_there, tracer.offset, weight, target, origins, directions, reach)
         if rays and any(sample.colour):
-            seen = tracer.unoccluded(origins[:rays], directions[:rays], reach[:rays])
+            seen = tracer.unoccluded(origins[:rays], directions[:rays], reach[:rays]) if shadows else np.ones(rays, np.int32)
             _collect(seen, target, weight, sample.colour / samples, samples, index * size // samples, total)
 
 

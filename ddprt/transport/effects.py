@@ -76,7 +76,10 @@ def _diffuse_bounces(name: str, scene: Scene, lightings: Sequence[Lighting], bou
     if bounces >= 0:
         left = albedo ** (bounces + 1) / (1 - albedo) if albedo < 1 else None
         return Effect(name, bounces > 0, f"forced to {bounces} (largest albedo {albedo:.3g})", left, True)
-    return Effect(name, True, f'largest albedo {albedo:.3g} ("{brightest.name}"), and surfaces face each other')
+    why = f'largest albedo {albedo:.3g} ("{brightest.name}"), and surfaces face each other'
+    if albedo >= 1:
+        return Effect(name, True, f"{why}; where they close it in, light never dies away: lower it", None)
+    return Effect(name, True, why)
 
 
 def _light_kind(kind: str) -> Callable[[str, Scene, Sequence[Lighting], int], Effect]:

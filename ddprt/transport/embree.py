@@ -1,7 +1,8 @@
 """The only door to Embree: closest hits and shadow rays, threaded over slices.
 
 Rays live in the scene's own frame (relative to its centre), so that float32 keeps its precision far from the origin.
-Every origin is moved off its surface by one named distance, and shadow rays stop short of the light by the same.
+Every origin is moved off its surface by one named distance, and shadow rays stop short of the light by the same. Sides of a
+sheet without thickness, which a ray could not tell apart, are traced that distance from each other.
 """
 
 import os
@@ -19,6 +20,7 @@ from ddprt.axes import Bool, Float32, Float64, Int32
 from ddprt.errors import UserError
 from ddprt.scene.distance import distance_within
 from ddprt.scene.mesh import Scene
+from ddprt.scene.sheets import back_to_back
 
 SELF_OFFSET = 2e-6
 """Distance between a ray's origin and its surface, as a share of the bounding box's diagonal: about 30 times the rounding
@@ -77,9 +79,12 @@ class Tracer:
         cross = np.cross(local[:, 1] - local[:, 0], local[:, 2] - local[:, 0]).astype(np.float64)
         self.normals = (cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-300)).astype(np.float32)
         self.frames = warp.frame(self.normals)
+        # Each side of a sheet forward by half: receivers, lifted by the whole, stay before their own. Only Embree knows.
+        traced, sheets = local.copy(), back_to_back(local.astype(np.float64), float(self.offset) / 2)
+        traced[sheets] += self.offset / 2 * self.normals[sheets, None]
         self._embree = EmbreeScene()
         self._mesh = TriangleMesh(
-            self._embree, local.reshape(-1, 3), np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)
+            self._embree, traced.reshape(-1, 3), np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)
         )
         # The first run commits the scene; it must not happen in two threads at once.
         self._embree.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))

@@ -8,6 +8,7 @@ import numpy as np
 from ddprt.axes import Float64
 from ddprt.errors import UserError
 from ddprt.lights import Light, Lighting, parse_lighting
+from ddprt.scene.checks import FARTHEST
 from ddprt.scene.mesh import Scene
 from ddprt.transport.embree import Tracer
 from ddprt.transport.reference import on_points, trace_reference
@@ -43,16 +44,19 @@ def irradiance(
         raise UserError(
             f"positions and normals: got shapes {place.shape} and {facing.shape}, expected (points, 3) for both, points > 0"
         )
-    length = np.linalg.norm(facing, axis=1, keepdims=True)
-    if not np.isfinite([place, facing]).all() or not (length > 0).all():
+    if not np.isfinite([place, facing]).all() or not facing.any(1).all():
         raise UserError("positions and normals: got a number that is not finite or a normal of length 0")
+    if np.abs(place).max() > FARTHEST:
+        raise UserError(f"positions: got {np.abs(place).max():.3g} m, expected at most {FARTHEST:g}; mind the unit")
+    facing = facing / np.abs(facing).max(1, keepdims=True)  # squares of the rest neither overflow nor vanish
+    facing /= np.linalg.norm(facing, axis=1, keepdims=True)
     if samples < 1 + return_variance:
         raise UserError(f"samples: got {samples}, expected at least {1 + return_variance}")
     parsed = parse_lighting(lighting)
     tracer = Tracer.of(scene)
     # A probe may float in free air, where even a convex scene sends light to it: only black scenes end at direct light.
     black = all(max(material.albedo) == 0 for material in scene.materials)
-    start = on_points(tracer, place, facing / length)
+    start = on_points(tracer, place, facing)
     estimate = trace_reference(tracer, scene, parsed, start, len(place), samples, seed=seed, bounces=0 if black else -1)
     if return_variance:
         return estimate.direct, estimate.indirect, estimate.direct_variance, estimate.indirect_variance

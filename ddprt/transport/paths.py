@@ -31,7 +31,7 @@ from ddprt.transport.embree import Tracer, lifted
 from ddprt.transport.gather import Receivers
 
 _SURVIVAL = 2.0  # times the throughput: chance to go on. Bounces are cheap beside the shadow rays of all lights
-_MAX_SURVIVAL = 0.95  # a white closed room would never let a path go
+_MAX_SURVIVAL = 0.999  # a white closed room would never let a path go; a lower cap has no finite variance above its root
 _FAINT = 2.0  # times the mean of a block: weaker light gets a shadow ray in proportion to its strength
 _PROBED, _PILOT = 512, 32  # texels, and paths of each in two independent runs, that predict how many are needed
 _LEAST, _MOST = 8, 8192  # paths per texel that "auto" may choose

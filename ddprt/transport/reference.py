@@ -19,7 +19,7 @@ from ddprt.transport.direct import centred, direct_irradiance
 from ddprt.transport.embree import Tracer, lifted
 
 _BATCH = 1 << 15  # paths traced together
-_MAX_SURVIVAL = 0.95  # a white closed room would never let a path go
+_MAX_SURVIVAL = 0.999  # a white closed room would never let a path go; a lower cap has no finite variance above its root
 
 Start = Callable[[Int[np.ndarray, " n"], np.random.Generator], tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]]
 """Maps receiver indices to positions (centred frame) and geometric normals."""
