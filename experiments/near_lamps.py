@@ -324,6 +324,7 @@ WAYS: dict[str, Way | Packaged] = {
     "at 0.75, smooth over 1 m": replace(SUNK, smooth=1.0),
     "at 0.75, Gaussian kernel": replace(SUNK, feature=radial),
     "PLAIN": Packaged(sunk=False),
+    "SMOOTH 2": Packaged(2.0, sunk=False),
     "SUNK": Packaged(),
     **{f"SUNK, SMOOTH {reach:g}": Packaged(reach) for reach in (1.0, 2.0, 4.0)},
     "(exact means over patches)": Way(measure=exact),

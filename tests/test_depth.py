@@ -299,13 +299,18 @@ def lamps(*heights: float) -> list[Lighting]:
     return [parse_lighting({"type": "point", "position": place, "intensity": [1, 2, 3]}) for place in places]
 
 
+@pytest.fixture(scope="module")
+def data(cornell: Scene, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """Every other lamp stands 2 mm above the floor."""
+    return ddprt.bake(cornell, lamps(*[0.002, 0.2] * 6), config=job(), out=tmp_path_factory.mktemp("depth") / "data")
+
+
 @pytest.mark.parametrize("nearest", [0.98, 1.02])
-def test_depth_is_for_lamps_nearer_than_samples_are_to_each_other(cornell: Scene, nearest: float) -> None:
-    spacing = place_samples(cornell, 256, on="surface", seed=0).spacing
-    lightings = lamps(0.27, 0.27, nearest * spacing)
-    data = ddprt.bake(cornell, lightings, config=job())
-    assert data.samples.spacing == spacing
-    assert data.samples.depth == (DEPTH * spacing if nearest < 1 else 0)
+def test_depth_is_for_lamps_nearer_than_samples_are_to_each_other(cornell: Scene, data: Dataset, nearest: float) -> None:
+    spacing = data.samples.spacing
+    samples = ddprt.bake(cornell, lamps(0.27, 0.27, nearest * spacing), config=job()).samples
+    assert samples.spacing == spacing
+    assert samples.depth == (DEPTH * spacing if nearest < 1 else 0)
 
 
 def test_depth_as_asked(cornell: Scene, tmp_path: Path) -> None:
@@ -339,12 +344,6 @@ def test_a_depth_out_of_range_is_one_line(depth: str) -> None:
     with pytest.raises(UserError, match=r"points\.depth") as caught:
         load_config(None, {"points.depth": depth})
     assert "\n" not in str(caught.value)
-
-
-@pytest.fixture(scope="module")
-def data(cornell: Scene, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    """Every other lamp stands 2 mm above the floor."""
-    return ddprt.bake(cornell, lamps(*[0.002, 0.2] * 6), config=job(), out=tmp_path_factory.mktemp("depth") / "data")
 
 
 def test_a_saved_model_measures_what_was_baked(data: Dataset, tmp_path: Path) -> None:
