@@ -9,7 +9,7 @@ Command:  python experiments/bake_speed.py --quick            under a minute; la
           python experiments/bake_speed.py sampling           what the sequence saves against independent numbers
           python experiments/bake_speed.py draw               docs/baking.png, from what these left in runs/
           python experiments/bake_speed.py scaling            slopes over texels, rays, lightings and triangles
-          python experiments/bake_speed.py bias               operator against reference on every library scene
+          python experiments/bake_speed.py bias [SCENE ...]   operator against unbiased paths, on all scenes that bounce light
 Answer:   docs/baking.md
 
 Seconds are those of making the indirect maps in memory, all that depends on a lighting included (so the direct light that the
@@ -575,10 +575,10 @@ def scaling() -> None:
     show("triangles", sizes, seconds)
 
 
-def bias() -> None:
-    """What senders and footprints cost, against unbiased paths, on every scene that bounces light."""
+def bias(*names: str) -> None:
+    """What senders and footprints cost, against unbiased paths, on scenes that bounce light."""
     print("scene       senders a side   noise of a bake   bias (within two standard errors)")
-    for name in ("cornell", "corridor", "statue", "cornell-hole", "plates"):
+    for name in names or ("cornell", "corridor", "statue", "cornell-hole", "plates"):
         on = stage(name, 256, 8, 1)
         reference = truth(on, on.train, 1024, 16384)
         for side in (32, 64, 128, 256):

@@ -137,7 +137,7 @@ def test_the_search_agrees_with_its_slow_twin(seed: int) -> None:
 
 
 def test_planes_are_known_as_well_as_their_corners() -> None:
-    """Small sheets everywhere: rounding to float32 tilts a side of height w by 1e-7 / w, and its plane moves by 5 times that."""
+    """Small sheets everywhere: rounding to float32 tilts a side of height w by 1e-7 / w, and moves its plane by 5e-7 / w."""
     rng = np.random.default_rng(0)
     side = np.array([[0.0, 0, 0], [0, 0, 1e-3], [1e-3, 0, 0]])
     turns = np.linalg.qr(rng.normal(size=(2000, 3, 3)))[0]
