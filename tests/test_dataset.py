@@ -325,3 +325,9 @@ def test_a_noise_out_of_reach_is_said(cornell: Scene, monkeypatch: pytest.Monkey
     words = capsys.readouterr().err
     assert "warning: transport.target_noise: got 0.001, but the most rays that are traced unasked leave 0." in words
     assert "transport.test_samples" not in words
+
+
+@pytest.mark.parametrize("beside", [{"resolution": 64}, {"samples": 8}, {"seed": 0}, {"resolution": 32, "seed": 1}])
+def test_settings_beside_a_config_are_refused(beside: dict, cornell: Scene) -> None:
+    with pytest.raises(UserError, match=f"got {' and '.join(beside)} beside a config"):
+        bake(cornell, config=Config(), **beside)

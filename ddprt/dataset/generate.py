@@ -41,9 +41,9 @@ def bake(
     scene: Scene,
     lightings: Sequence[Lighting] | Splits | None = None,
     *,
-    resolution: int = 256,
-    samples: int | Literal["auto"] = "auto",
-    seed: int = 0,
+    resolution: int | None = None,
+    samples: int | Literal["auto"] | None = None,
+    seed: int | None = None,
     config: Config | None = None,
     out: str | Path | None = None,
     progress: Progress | None = None,
@@ -54,22 +54,30 @@ def bake(
       scene: from `ddprt.load_scene`.
       lightings: a mapping of "train", "validation" and "test" to lightings; or one list, of which the last fifth becomes test
         and the tenth before it validation; or None to draw them as the configuration says.
-      resolution: texels per side of the lightmap.
-      samples: gather rays per texel (twice as many for held-out lightings); "auto" as many as `config.transport.target_noise`
-        asks for.
-      seed: of all random numbers.
-      config: all settings at once; replaces `resolution`, `samples` and `seed`.
+      resolution: texels per side of the lightmap; 256 unless given.
+      samples: gather rays per texel (twice as many for held-out lightings); "auto", the default, as many as
+        `config.transport.target_noise` asks for.
+      seed: of all random numbers; 0 unless given.
+      config: all settings at once, in place of `resolution`, `samples` and `seed`.
       out: folder; an unfinished bake of the same settings there goes on. None bakes into a temporary folder that lives as
         long as the dataset.
       progress: shown if given.
     Returns:
       The finished dataset.
     Raises:
-      UserError: no lightings, all of them dark, too many points, or a folder that holds another dataset.
+      UserError: no lightings, all of them dark, too many points, a folder that holds another dataset, or a configuration
+        together with one of the settings that it replaces.
     """
+    given = {
+        name: value for name, value in (("resolution", resolution), ("samples", samples), ("seed", seed)) if value is not None
+    }
     if config is None:
-        transport = {"samples": samples, "test_samples": "auto" if samples == "auto" else 2 * samples}
-        config = Config.model_validate({"seed": seed, "atlas": {"resolution": resolution}, "transport": transport})
+        rays = given.get("samples", "auto")
+        transport = {"samples": rays, "test_samples": rays if rays == "auto" else 2 * rays}
+        atlas = {"resolution": given.get("resolution", 256)}
+        config = Config.model_validate({"seed": given.get("seed", 0), "atlas": atlas, "transport": transport})
+    elif given:
+        raise UserError(f"bake: got {' and '.join(given)} beside a config, expected one or the other; set it in the config")
     keep_alive = tempfile.TemporaryDirectory(prefix="ddprt-") if out is None else None
     folder = Path(keep_alive.name if keep_alive else str(out))
     return _Bake(scene, config, folder, progress or Progress(quiet=True)).run(lightings, keep_alive)
