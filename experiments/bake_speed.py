@@ -368,7 +368,7 @@ def relit_faster(ours: Sequence[Run], seconds: float, error: float) -> float:
 def quick() -> None:
     begun = time.perf_counter()
     count = 128
-    both = Comparison("cornell", count, 6, (512, 4096))
+    both = Comparison("cornell", count, 5, (512, 4096))
     shares = share_of_embree(both.on, 3)
     ours = both.ours((16, 64, 256), count) + both.ours((1024,), count, repeats=1)  # the last is the floor alone
     low, relit = both.theirs(16, count, (count,))
