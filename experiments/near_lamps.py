@@ -363,7 +363,7 @@ def draw_bars(found: dict[str, tuple[dict[str, np.ndarray], np.ndarray]]) -> Non
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, rows = plt.subplots(len(found), 3, figsize=(12, 4.6 * len(found)), sharey=True, layout="constrained")
+    figure, rows = plt.subplots(len(found), 3, figsize=(12, 4.6 * len(found)), sharey="row", layout="constrained")
     for axes, (scenario, (errors, floor)) in zip(np.atleast_2d(rows), found.items(), strict=True):
         for axis, name, column in zip(axes, FIGURES, range(3), strict=True):
             heights = [error[column] for error in errors.values()]
@@ -374,7 +374,7 @@ def draw_bars(found: dict[str, tuple[dict[str, np.ndarray], np.ndarray]]) -> Non
             axis.set_yticks(range(len(heights)), list(errors))
             axis.set_xlim(0, 1.3 * heights[0])
             axis.set_title(f"{scenario}: {name}")
-    figure.axes[0].invert_yaxis()  # shared by all
+        axes[0].invert_yaxis()  # shared by the row, whose ways may not be those of another
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     figure.savefig("docs/near-lamps.png", dpi=110)
 
