@@ -119,6 +119,13 @@ class Tracer:
         self._count(len(origins))
         return self._embree.run(origins, directions, dists=reach, query="OCCLUDED")
 
+    def on_triangle(
+        self, triangle: Int32[np.ndarray, " n"], u: Float32[np.ndarray, " n"], v: Float32[np.ndarray, " n"]
+    ) -> Float32[np.ndarray, "n 3"]:
+        """Places of hits, by weights of the corners: nearer to the surface than a distance along the ray tells."""
+        a, b, c = np.moveaxis(self.corners[triangle], 1, 0)
+        return a + u[:, None] * (b - a) + v[:, None] * (c - a)
+
     def _count(self, rays: int) -> None:
         with self._counting:
             self.rays += rays

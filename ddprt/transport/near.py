@@ -117,9 +117,8 @@ class NearField:
         self, near: Near, weight: np.ndarray, table: np.ndarray, rng: np.random.Generator, sums: np.ndarray
     ) -> tuple[Near, np.ndarray]:
         """Sends a ray from each, adds what the senders there radiate, and gives those that are near again."""
-        frames = warp.frame(near.normal)
-        directions = np.einsum("nk,nkd->nd", warp.sample_cosine(rng.random((len(near.cell), 2), np.float32)), frames)
-        directions = np.ascontiguousarray(directions, np.float32)
+        local = warp.sample_cosine(rng.random((len(near.cell), 2), np.float32))
+        directions = warp.to_world(local, warp.frame(near.normal))
         triangle, u, v, distance = self.tracer.first(lifted(self.tracer, near.position, near.normal), directions)
         cells = landed_on(self.tracer, self.landing, directions, triangle, u, v)
         lit = np.flatnonzero(cells >= 0)
@@ -132,9 +131,7 @@ class NearField:
         return chosen[: _pick(cells, distance, self.reach, chosen)]
 
     def _at(self, receiver: np.ndarray, cell: np.ndarray, triangle: np.ndarray, u: np.ndarray, v: np.ndarray) -> Near:
-        a, b, c = self.tracer.corners[triangle].swapaxes(0, 1)
-        position = a + u[:, None] * (b - a) + v[:, None] * (c - a)
-        return Near(receiver, cell, position, self.tracer.normals[triangle])
+        return Near(receiver, cell, self.tracer.on_triangle(triangle, u, v), self.tracer.normals[triangle])
 
 
 def _joined(parts: Sequence[Near]) -> Near:

@@ -1,7 +1,7 @@
 """Indirect light of all lightings at once: G, the gather operator, is traced once per scene.
 
 The light that leaves the surfaces lives on *senders*, small blocks of texels, each holding the direct light that it got. What
-bounces on from there is smooth: it is solved for on coarser blocks, as the Neumann series of a dense matrix, and interpolated
+bounces on from there is smooth: it is solved for on coarser blocks, as the Neumann series of their matrix, and interpolated
 back between their centres within each chart. In the end every receiver adds up the radiosity of the senders that its rays meet:
 
     E = G b,    b = R (E0 + P (e_1 + e_2 + ...)),    e_1 = G R E0,    e_k+1 = G P R e_k,    all e_k on the coarse blocks
@@ -30,7 +30,7 @@ from ddprt.transport.gather import Landing, Receivers, seen_from
 from ddprt.transport.near import WIDTHS, NearField
 
 _SENDER_RESOLUTION = 128  # senders along a side where nothing else is asked for
-_COARSE = 3000  # most blocks that bounces are solved on: 36 MB of matrix
+_COARSE = 3000  # most blocks that bounces are solved on
 _COARSE_SAMPLES = 256  # rays of each: their noise is averaged once more over all that a texel sees
 _TOGETHER = 8  # tiles whose near rays are lit together, and that are stored at once
 _TOLERANCE = 1e-4  # of a lighting's largest indirect value: where the series stops

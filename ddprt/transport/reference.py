@@ -106,7 +106,7 @@ def _paths(
         alive, triangle = alive[keep], hits.triangle[keep]
         throughput = throughput[keep] * albedo[keep] / survival[keep, None]
         normals = tracer.normals[triangle]
-        positions = _on_triangle(tracer, triangle, hits.u[keep], hits.v[keep])
+        positions = tracer.on_triangle(triangle, hits.u[keep], hits.v[keep])
         light = direct_irradiance(tracer, lights, positions, normals, _numbers(rng, len(lights), len(alive)))
         indirect[alive] += throughput * light
         depth += 1
@@ -120,11 +120,6 @@ def _numbers(rng: np.random.Generator, lights: int, count: int) -> Float32[np.nd
 def _albedo(scene: Scene, triangle: Int32[np.ndarray, " n"], u: np.ndarray, v: np.ndarray) -> Float32[np.ndarray, "n 3"]:
     weights = np.stack([1 - u - v, u, v], 1)
     return scene.albedo_at(triangle, weights).astype(np.float32)
-
-
-def _on_triangle(tracer: Tracer, triangle: Int32[np.ndarray, " n"], u: np.ndarray, v: np.ndarray) -> Float32[np.ndarray, "n 3"]:
-    a, b, c = np.moveaxis(tracer.corners[triangle], 1, 0)
-    return a + u[:, None] * (b - a) + v[:, None] * (c - a)
 
 
 def on_texels(tracer: Tracer, atlas: Atlas, texels: Int[np.ndarray, " receivers"]) -> Start:
