@@ -121,11 +121,33 @@ def left_out(
     The second is for generalised cross-validation, which puts the mean of 1 - h in the place of each (Golub, Heath and
     Wahba 1979).
     """
-    with jax.enable_x64(True):
-        parts = spectrum.left, spectrum.values, spectrum.turned, spectrum.targets
-        twins = jnp.asarray(spectrum.group), jnp.asarray(spectrum.count)
-        squares, generalised = _left_out(*parts, *twins, jnp.asarray(ridges), spectrum.rank)
-        return np.asarray(squares), np.asarray(generalised)
+    Q, S, QtC, C = (np.asarray(part) for part in (spectrum.left, spectrum.values, spectrum.turned, spectrum.targets))
+    group, count = spectrum.group, spectrum.count
+    held = np.arange(len(S)) < spectrum.rank
+    # A row that is orthogonal to all directions without signal, up to rounding, decides its own fit as the ridge goes to 0.
+    # There both sides of the quotient vanish with the ridge; without that factor they have a limit.
+    alone = np.sum(Q[:, ~held] ** 2, 1) <= (len(count) * np.finfo(np.float64).eps) ** 2
+    mean = np.zeros((len(count), C.shape[1]))
+    np.add.at(mean, group, C / count[group, None])
+    inward, weight, squares = C - mean[group], 1 / np.sqrt(count[group, None]), Q**2
+
+    def parts(share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return Q @ (share[:, None] * QtC), squares @ share
+
+    each, generalised = np.zeros((2, len(ridges), len(C)))
+    for index, ridge in enumerate(ridges):
+        # e_k = ((Id - H) c)_k / (1 - h_kk), where Id - H = Q diag(t) Q^T with t = ridge / (S² + ridge), 1 past the rank.
+        sizes = _positive(S**2 + ridge)
+        error, free = typical = parts(np.where(held, ridge / sizes, 1))
+        if alone.any():
+            near, bound = limit = parts(np.where(held, np.min(sizes, where=held, initial=np.inf) / sizes, 0))
+            error, free = np.where(alone[:, None], near, error), np.where(alone, bound, free)
+            typical = limit if held.all() else typical
+        general = typical[0] / (np.mean(typical[1]) or 1)
+        # Twins share a prediction: their mean target less the error of their row.
+        for found, row in ((each, error / _positive(free)[:, None]), (generalised, general)):
+            found[index] = np.sum((inward + row[group] * weight) ** 2, 1)
+    return each, generalised
 
 
 def choose_ridge(
@@ -223,34 +245,5 @@ def _decompose(
     return Q, S, Pt, jnp.matmul(Q.T, wanted, precision="highest"), C, offset, start, plain
 
 
-@jax.jit
-def _left_out(
-    Q: Array, S: Array, QtC: Array, C: Array, group: Array, count: Array, ridges: Array, rank: Array
-) -> tuple[Array, Array]:
-    """e_k = ((Id - H) c)_k / (1 - h_kk), where Id - H = Q diag(t) Q^T with t = ridge / (S² + ridge), 1 past the rank."""
-    held = jnp.arange(len(S)) < rank
-    empty = jnp.matmul(Q**2, 1.0 * ~held, precision="highest")
-    # A row that is orthogonal to all directions without signal, up to rounding, decides its own fit as the ridge goes to 0.
-    # There both sides of the quotient vanish with the ridge; without that factor they have a limit.
-    alone = empty <= (len(count) * jnp.finfo(jnp.float64).eps) ** 2
-    root = jnp.sqrt(count)[:, None]
-    mean = (jax.ops.segment_sum(C, group, len(count)) / count[:, None])[group]
-
-    def one(ridge: Array) -> tuple[Array, Array]:
-        sizes = jnp.where(S**2 + ridge > 0, S**2 + ridge, 1)
-        loose = jnp.where(held, ridge / sizes, 1)
-        tight = jnp.where(held, jnp.min(jnp.where(held, sizes, jnp.inf), initial=jnp.inf) / sizes, 0)
-        away, near = (jnp.matmul(Q * t, QtC, precision="highest") for t in (loose, tight))
-        free, bound = (jnp.matmul(Q**2, t, precision="highest") for t in (loose, tight))
-        error = jnp.where(alone[:, None], near, away) / _positive(jnp.where(alone, bound, free))[:, None]
-        whole = jnp.all(held)
-        general = jnp.where(whole, near, away) / _positive(jnp.mean(jnp.where(whole, bound, free)))
-        # Twins share a prediction: their mean target less the error of their row.
-        each, generalised = (jnp.sum((C - mean + (e / root)[group]) ** 2, 1) for e in (error, general))
-        return each, generalised
-
-    return jax.lax.map(one, ridges)
-
-
-def _positive(value: Array) -> Array:
-    return jnp.where(value > 0, value, 1)
+def _positive(value: np.ndarray) -> np.ndarray:
+    return np.where(value > 0, value, 1)
