@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from pydantic import BaseModel, ConfigDict
 
 from ddprt.methods.statuses import BLIND, NOTES, STATUSES, worst_first  # noqa: F401  (STATUSES is part of the contract)
@@ -167,10 +167,29 @@ def columns(examples: Examples) -> tuple[Float[Array, "columns entries"], Float[
     return (rows, size) if len(lit) == len(size) else (rows[lit], size[lit])
 
 
-def measurements(examples: Examples) -> Float[Array, "groups lightings inputs"]:
-    """Measured values per transfer matrix: one group per channel for mono, one of interleaved colours for multi."""
-    values = examples.frame.values
-    return jnp.moveaxis(values, 2, 0) if examples.channels == "mono" else values.reshape(1, len(values), -1)
+@dataclass(frozen=True)
+class Measured:
+    """What one transfer matrix learns from.
+
+    Attributes:
+      group: which matrix: one per channel for mono, one of interleaved colours for multi.
+      rows: the lightings that its channel sees.
+      values: scaled and encoded light of these at the points.
+      importance: s² of each.
+    """
+
+    group: int
+    rows: Int[np.ndarray, " rows"]
+    values: Float[Array, "rows inputs"]
+    importance: Float[np.ndarray, " rows"]
+
+
+def measured(examples: Examples) -> list[Measured]:
+    """One per transfer matrix that any lighting is seen by."""
+    values, scale = examples.frame.values, np.asarray(examples.scale, np.float64)
+    groups = jnp.moveaxis(values, 2, 0) if examples.channels == "mono" else values.reshape(1, len(values), -1)
+    lit = [np.flatnonzero(scale[:, group] > 0) for group in range(len(groups))]
+    return [Measured(g, rows, groups[g][rows], scale[rows, g] ** 2) for g, rows in enumerate(lit) if len(rows)]
 
 
 def unseen_share(scale: Float[np.ndarray, "lightings 3"], indirect: Float[np.ndarray, "lightings texels 3"]) -> float:

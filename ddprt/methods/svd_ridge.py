@@ -21,7 +21,7 @@ from ddprt.errors import UserError
 from ddprt.fitting.basis import entry_weights, fit_basis
 from ddprt.fitting.selection import Spectrum, choose_ridge, decompose
 from ddprt.fitting.transfer import point_stretch, solve_transfer
-from ddprt.methods.method import Examples, FitReport, Frame, Method, array_bytes, as_pytree, columns, found_in, measurements
+from ddprt.methods.method import Examples, FitReport, Frame, Method, array_bytes, as_pytree, columns, found_in, measured
 
 
 @as_pytree
@@ -91,25 +91,24 @@ class SvdRidge(Method):
         centre = self.centre == "mean"
         basis = fit_basis(rows, entries, bases=max(self.bases - centre, 1), centre=centre)
         per_group = _spread(basis.coefficients, train, basis.vectors.shape[0])
-        inputs, scale = np.asarray(measurements(train)), np.asarray(train.scale, np.float64)
-        lit = [np.flatnonzero(scale[:, group] > 0) for group in range(len(inputs))]
-        used = [group for group, rows in enumerate(lit) if len(rows)] if basis.rank else []
-        stretch = point_stretch(self.ridge, inputs.shape[2])
-        parts = [(jnp.asarray(inputs[g][lit[g]]), jnp.asarray(per_group[g][lit[g]])) for g in used]
+        seen = measured(train) if basis.rank else []
+        inputs = train.frame.values.shape[1] * (1 if train.channels == "mono" else 3)
+        stretch = point_stretch(self.ridge, inputs)
+        parts = [(part.values, jnp.asarray(per_group[part.group][part.rows])) for part in seen]
         if self.smooth:
             root = likeness_root(train.frame, self.smooth)
             root = root if train.channels == "mono" else np.kron(root, np.eye(3))
             spectra = [_smoothed(X, C, root, intercept=centre) for X, C in parts]
         else:
             spectra = [decompose(X, C, stretch=stretch, intercept=centre) for X, C in parts]
-        weight = [scale[lit[g], g] ** 2 for g in used]
-        choice = choose_ridge(spectra, weight, [lit[g] for g in used]) if self.ridge == "auto" and used else None
+        weight = [part.importance for part in seen]
+        choice = choose_ridge(spectra, weight, [part.rows for part in seen]) if self.ridge == "auto" and seen else None
         ridge = choice.ridge if choice else self.ridge
         solved = [solve_transfer(spectrum, ridge, stretch, w) for spectrum, w in zip(spectra, weight, strict=True)]  # type: ignore[arg-type]
-        fitted = dict(zip(used, solved, strict=True))
-        shape = (basis.vectors.shape[0], inputs.shape[2])
+        fitted = {part.group: transfer for part, transfer in zip(seen, solved, strict=True)}
+        shape = (basis.vectors.shape[0], inputs)
         stack = lambda pick, size: jnp.stack(  # noqa: E731
-            [pick(fitted[g]) if g in fitted else jnp.zeros(size) for g in range(len(inputs))]
+            [pick(fitted[g]) if g in fitted else jnp.zeros(size) for g in range(len(per_group))]
         )
         report = FitReport(
             bases=int(shape[0]) + centre,

@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float
 from ddprt.fitting.basis import entry_weights
 from ddprt.fitting.encoding import Encoding
 from ddprt.fitting.selection import RANK_CUT, Spectrum, choose_ridge, decompose
-from ddprt.methods.method import Examples, measurements
+from ddprt.methods.method import Examples, measured
 
 FALSE_ALARMS = 0.05
 """Share of lightings like the training ones that are called extrapolating."""
@@ -98,28 +98,22 @@ class Yardstick:
 
 def make_yardstick(train: Examples, encoding: Encoding) -> Yardstick:
     """Directions, ridge and level from the training lightings; the ridge is the one that predicts left-out maps best."""
-    inputs, scale = np.asarray(measurements(train), np.float64), np.asarray(train.scale, np.float64)
-    spectra: list[Spectrum] = []
-    lit = [np.flatnonzero(scale[:, group] > 0) for group in range(len(inputs))]
-    for sketch, rows, known in zip(_sketched(train), inputs, lit, strict=True):
-        if len(known):
-            spectra.append(decompose(jnp.asarray(rows[known]), jnp.asarray(sketch[known])))
-    importance = [scale[known, group] ** 2 for group, known in enumerate(lit) if len(known)]
-    largest = max((float(spectrum.values[0]) for spectrum in spectra), default=1.0)
-    ridge = choose_ridge(spectra, importance, [known for known in lit if len(known)]).ridge if spectra else 0.0
+    seen, sketches = measured(train), _sketched(train)
+    spectra = [decompose(part.values, jnp.asarray(sketches[part.group][part.rows])) for part in seen]
+    ridge = choose_ridge(spectra, [part.importance for part in seen], [part.rows for part in seen]).ridge if seen else 0.0
     # Directions that are rounding alone count as unexplained.
-    ridge = max(ridge, (RANK_CUT * largest) ** 2)
-    directions = np.zeros((len(inputs), max((len(s.right) for s in spectra), default=0), inputs.shape[2]), np.float32)
+    ridge = max(ridge, (RANK_CUT * max((spectrum.largest for spectrum in spectra), default=1.0)) ** 2)
+    inputs = train.frame.values.shape[1] * (1 if train.channels == "mono" else 3)
+    directions = np.zeros((len(sketches), max((len(s.right) for s in spectra), default=0), inputs), np.float32)
     shares = np.ones(directions.shape[:2], np.float32)
-    novelty, weight = np.zeros(len(scale)), np.zeros(len(scale))
-    for group, spectrum in zip((g for g, known in enumerate(lit) if len(known)), spectra, strict=True):
+    novelty, weight = np.zeros(len(train.scale)), np.zeros(len(train.scale))
+    for part, spectrum in zip(seen, spectra, strict=True):
         count = len(spectrum.right)
-        directions[group, :count] = np.asarray(spectrum.right)
-        shares[group, :count] = ridge / (np.asarray(spectrum.values)[:count] ** 2 + ridge)
-        energy = scale[lit[group], group] ** 2
-        size = np.sum(inputs[group][lit[group]] ** 2, 1)
-        novelty[lit[group]] += energy * np.minimum(_left_out(spectrum, ridge) / size, 1)
-        weight[lit[group]] += energy
+        directions[part.group, :count] = np.asarray(spectrum.right)
+        shares[part.group, :count] = ridge / (np.asarray(spectrum.values)[:count] ** 2 + ridge)
+        size = np.sum(np.asarray(part.values, np.float64) ** 2, 1)
+        novelty[part.rows] += part.importance * np.minimum(_left_out(spectrum, ridge) / size, 1)
+        weight[part.rows] += part.importance
     alone = np.sort(novelty[weight > 0] / weight[weight > 0])
     place = math.ceil((len(alone) + 1) * (1 - FALSE_ALARMS))  # of one more lighting of the same kind among them
     level = float(alone[min(place, len(alone)) - 1]) if len(alone) else 0.0
