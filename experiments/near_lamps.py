@@ -222,6 +222,11 @@ def rooted(train: np.ndarray, test: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return np.concatenate([train, np.sqrt(train)], 1), np.concatenate([test, np.sqrt(test)], 1)
 
 
+def logged(train: np.ndarray, test: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Values and their logarithms, straight where a value is well below the root mean square."""
+    return tuple(np.concatenate([rows, np.log1p(rows * np.sqrt(POINTS))], 1) for rows in (train, test))  # type: ignore[return-value]
+
+
 def radial(train: np.ndarray, test: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Kernel ridge regression with a Gaussian of the square roots, as wide as the median distance."""
     a, b = np.sqrt(train), np.sqrt(test)
@@ -285,11 +290,12 @@ class Packaged:
 
     smooth: float = 0.0
     sunk: bool = True
+    space: str = "linear"
 
     def scores(self, problem: Problem) -> np.ndarray:
         """See `Way`."""
         data = problem.sunk if self.sunk else problem.data
-        model = ddprt.fit(data, bases=BASES, settings={"smooth": self.smooth})
+        model = ddprt.fit(data, bases=BASES, space=self.space, settings={"smooth": self.smooth})
         return problem.scores_of(model.predict(data.values(problem.splits[1], POINTS, "radiosity")))
 
 
@@ -312,6 +318,7 @@ WAYS: dict[str, Way | Packaged] = {
     "a ridge per basis": replace(BASE, per_basis=True),
     "scale by the 1/2-norm": replace(BASE, power=0.5),
     "values and roots": replace(BASE, feature=rooted),
+    "values and logarithms": replace(BASE, feature=logged),
     "Gaussian kernel": replace(BASE, feature=radial),
     "samples by pivoted QR": replace(BASE, measure=pivoted),
     "samples capped": replace(BASE, measure=capped),
@@ -325,7 +332,9 @@ WAYS: dict[str, Way | Packaged] = {
     "at 0.75, Gaussian kernel": replace(SUNK, feature=radial),
     "PLAIN": Packaged(sunk=False),
     "SMOOTH 2": Packaged(2.0, sunk=False),
+    "PLAIN, GAMMA 2.2": Packaged(sunk=False, space="gamma"),
     "SUNK": Packaged(),
+    "SUNK, GAMMA 2.2": Packaged(space="gamma"),
     **{f"SUNK, SMOOTH {reach:g}": Packaged(reach) for reach in (1.0, 2.0, 4.0)},
     "(exact means over patches)": Way(measure=exact),
 }
