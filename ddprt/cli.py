@@ -7,13 +7,16 @@ so that help is instant.
 import os
 import shlex
 import sys
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
 
 from ddprt import __version__
 from ddprt.errors import UserError, nearest
+from ddprt.progress import Doubt
 
 REPORT_ISSUE = "this is our fault: run again with --debug and report what it prints"
 
@@ -98,9 +101,11 @@ def relight(call: Call) -> None:
 
     source, out = call.options.get("lighting"), Path(call.options.get("out", "relit.exr"))
     if source is None:
-        raise UserError('ddprt relight: got no --lighting, expected a JSON file or text such as [{"type": "point", ...}]')
+        raise UserError(
+            'ddprt relight: got no --lighting, expected a JSON file or text such as [{"type": "point", ...}]; add it'
+        )
     if out.suffix != ".exr":
-        raise UserError(f"--out: got {out}, expected a path that ends in .exr")
+        raise UserError(f"--out: got {out}, expected a path that ends in .exr; name it so")
     model = load_model(call.file("a model folder such as runs/cornell/model.ddprt"))
     if source.lstrip().startswith(("[", "{")):
         try:
@@ -108,7 +113,9 @@ def relight(call: Call) -> None:
             several = isinstance(records, list) and bool(records) and isinstance(records[0], list)
             lightings = [parse_lighting(entry, "--lighting") for entry in (records if several else [records])]
         except (json.JSONDecodeError, RecursionError) as error:
-            raise UserError(f"--lighting: not JSON: {error}") from None
+            raise UserError(
+                f'--lighting: got text that is not JSON ({error}), expected [{{"type": "point", ...}}] or the like; mend it'
+            ) from None
     else:
         lightings = load_lightings(source)
     for index, lighting in enumerate(lightings):
@@ -165,7 +172,7 @@ def doctor(call: Call) -> None:
     lines, fine = checkup()
     print(lines)
     if not fine:
-        raise UserError("doctor: something above needs mending")
+        raise UserError("doctor: got parts that are missing or broken, expected all to work; mend what is marked above")
 
 
 @dataclass(frozen=True)
@@ -212,7 +219,8 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     typed = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in typed
     try:
-        code = _dispatch([word for word in typed if word != "--debug"])
+        with _doubts_in_one_line():
+            code = _dispatch([word for word in typed if word != "--debug"])
         sys.stdout.flush()
     except UserError as error:
         if debug:
@@ -231,6 +239,23 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         print(f"ddprt: {type(error).__name__}: {error} ({REPORT_ISSUE})", file=sys.stderr)
         code = 1
     sys.exit(code)
+
+
+@contextmanager
+def _doubts_in_one_line() -> Iterator[None]:
+    """Doubts about a result reach stderr even with --quiet, each as one line and without a line of code below it."""
+    with warnings.catch_warnings():
+        as_before = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *where: Any) -> None:
+            if issubclass(category, Doubt):
+                print(f"warning: {message}", file=sys.stderr, flush=True)
+            else:
+                as_before(message, category, *where)
+
+        warnings.simplefilter("always", Doubt)
+        warnings.showwarning = show  # type: ignore[assignment]
+        yield
 
 
 def _dispatch(words: list[str]) -> int:
@@ -280,7 +305,7 @@ def parse(name: str, words: list[str]) -> Call:
             raise UserError(f"--{key}: unknown option{nearest(key, choices)}; `ddprt {name} --help` lists all")
         if not given:
             if not queue:
-                raise UserError(f"--{key}: got no value, expected one after it")
+                raise UserError(f"--{key}: got no value, expected one after it; write --{key} VALUE")
             value = queue.pop(0)
         (call.options if key in verb.options else call.overrides)[key] = value
     return call

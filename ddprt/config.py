@@ -71,16 +71,22 @@ class LightingsConfig(Section):
         for name in ("lights", "distance", "elevation_deg", "intensity", "saturation", "spot_outer_deg"):
             low, high = getattr(self, name)
             if low > high:
-                raise ValueError(f"{name}: got [{low}, {high}], expected the lower end first")
+                raise ValueError(f"{name}: got [{low:g}, {high:g}], expected the lower end first; swap them")
         if self.lights[0] < 1:
-            raise ValueError(f"lights: got {self.lights[0]}, expected at least 1")
-        if not 0 <= self.saturation[0] <= self.saturation[1] <= 1:
-            raise ValueError("saturation: expected both ends between 0 and 1")
-        if not 0 < self.spot_outer_deg[0] <= self.spot_outer_deg[1] < 90:
-            raise ValueError("spot_outer_deg: expected half-angles between 0 and 90")
+            raise ValueError(f"lights: got {self.lights[0]} as the fewest, expected at least 1; raise it")
+        low, high = self.saturation
+        if not 0 <= low <= high <= 1:
+            raise ValueError(f"saturation: got [{low:g}, {high:g}], expected both ends between 0 and 1; move them there")
+        low, high = self.spot_outer_deg
+        if not 0 < low <= high < 90:
+            raise ValueError(
+                f"spot_outer_deg: got [{low:g}, {high:g}], expected half-angles above 0 and below 90; move them there"
+            )
         for axis, low, high in zip("xyz", self.region_low, self.region_high, strict=True):
             if low >= high:
-                raise ValueError(f"region: {axis} runs from {low} to {high}, expected a rising range")
+                raise ValueError(
+                    f"region_low: got {low:g} for {axis}, expected less than {high:g} of region_high; lower it or raise that"
+                )
         return self
 
 
@@ -211,16 +217,18 @@ def load_config(path: str | Path | None, overrides: dict[str, str] | None = None
     Returns:
       The validated configuration. Relative paths in it are taken from the working directory.
     Raises:
-      UserError: one line with file, key, got and expected for the first fault.
+      UserError: one line with file, key, got, expected and what to do for the first fault.
     """
     document: dict[str, Any] = {}
     if path is not None:
         try:
             document = tomllib.loads(Path(path).read_text("utf-8"))
         except OSError as error:
-            raise UserError(f"{path}: got {error.strerror or error}, expected a readable TOML file") from None
+            raise UserError(f"{path}: got {error.strerror or error}, expected a readable TOML file; check the path") from None
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise UserError(f"{path}: not TOML: {error}") from None
+            raise UserError(
+                f"{path}: got text that is not TOML ({error}), expected [section] and key = value; mend it"
+            ) from None
     overrides = {_as_written(dotted): text for dotted, text in (overrides or {}).items()}
     for dotted, text in overrides.items():
         _check_key(dotted)
@@ -231,10 +239,19 @@ def load_config(path: str | Path | None, overrides: dict[str, str] | None = None
             if not isinstance(table, dict):
                 raise UserError(f"--{dotted}: got a table, but {path} gives {parent} a plain value; mend the file")
         table[leaf] = _literal(text)
+    return checked(document, path, overrides)
+
+
+def checked(document: dict[str, Any], path: str | Path | None = None, overrides: dict[str, str] | None = None) -> Config:
+    """A nested dictionary as a configuration; `path` and `overrides` are where it came from.
+
+    Raises:
+      UserError: see `load_config`.
+    """
     try:
         return Config.model_validate(document)
     except ValidationError as error:
-        raise UserError(explain(error, path, overrides)) from None
+        raise UserError(explain(error, path, overrides or {})) from None
 
 
 def keys(model: type[BaseModel] = Config, prefix: str = "") -> list[str]:
@@ -250,10 +267,13 @@ def keys(model: type[BaseModel] = Config, prefix: str = "") -> list[str]:
 
 
 def explain(error: ValidationError, path: str | Path | None, overrides: dict[str, str]) -> str:
-    """First fault of a pydantic error as one line: file, key, got, expected, nearest spelling."""
+    """First fault of a pydantic error as one line: file, key, got, expected, what to do."""
     faults = error.errors()
     fault = faults[0]
-    place = [str(part) for part in fault["loc"]]
+    place, text = [str(part) for part in fault["loc"]], ""
+    if fault["type"] == "value_error":  # of a whole section: its text begins with the key
+        key, _, text = str(fault["ctx"]["error"]).partition(": ")
+        place.append(key)
     dotted = next((key for n in range(len(place), 0, -1) if (key := ".".join(place[:n])) in keys()), ".".join(place))
     source = f"--{dotted}" if dotted in overrides else f"{path or 'configuration'}: {dotted}"
     if fault["type"] == "extra_forbidden":
@@ -261,11 +281,11 @@ def explain(error: ValidationError, path: str | Path | None, overrides: dict[str
         sections = [*siblings, *(key.split(".")[0] for key in keys())] if len(place) == 1 else siblings
         names = sorted({key.rsplit(".", 1)[-1] for key in sections})
         return f"{source}: unknown key{nearest(place[-1], names)}; known here: {', '.join(names)}"
-    if fault["type"] == "value_error":
-        return f"{source}: {fault['ctx']['error']!s}" if place else f"{path}: {fault['ctx']['error']}"
+    if text:
+        return f"{source}: {text}"
     related = [other for other in faults if ".".join(map(str, other["loc"])).startswith(dotted)]
     expected = " or ".join(dict.fromkeys(_expected(other) for other in related))
-    return f"{source}: got {fault['input']!r}, expected {expected}{_choice_hint(fault)}"
+    return f"{source}: got {fault['input']!r}, expected {expected}; {_remedy(dotted, related)}"
 
 
 def _expected(fault: Any) -> str:
@@ -273,10 +293,32 @@ def _expected(fault: Any) -> str:
     return text.removeprefix("Input should have ").split(", unable")[0]
 
 
-def _choice_hint(fault: Any) -> str:
-    if fault["type"] != "literal_error" or not isinstance(fault["input"], str):
-        return ""
-    return nearest(fault["input"], fault["ctx"]["expected"].replace("'", "").replace(" or ", ", ").split(", "))
+def _remedy(dotted: str, faults: list[Any]) -> str:
+    """What to do about the faults of one key: its nearest spelling, which way to go, or back to the default."""
+    kinds = {fault["type"] for fault in faults}
+    for fault in faults:
+        if fault["type"] == "literal_error" and isinstance(fault["input"], str):
+            choices = fault["ctx"]["expected"].replace("'", "").replace(" or ", ", ").split(", ")
+            hint = nearest(fault["input"], choices)
+            if hint:
+                return hint.removeprefix("; ")
+    if kinds & {"greater_than", "greater_than_equal"}:
+        return "raise it"
+    if kinds & {"less_than", "less_than_equal"}:
+        return "lower it"
+    return f"mend it, or leave it out for the default{_default(dotted)}"
+
+
+def _default(dotted: str) -> str:
+    """ ", 16" for a key with such a default; empty for a section and what lies below a key."""
+    value: Any = Config()
+    for part in dotted.split("."):
+        value = getattr(value, part, None)
+    return (
+        ""
+        if value is None or isinstance(value, Section | dict)
+        else f", {_toml(list(value) if isinstance(value, tuple) else value)}"
+    )
 
 
 def _as_written(dotted: str) -> str:

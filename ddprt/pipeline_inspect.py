@@ -9,6 +9,9 @@ from ddprt import seeds
 from ddprt.config import Config, load_config
 from ddprt.errors import UserError
 from ddprt.machine import PACKAGES, installed, machine
+from ddprt.progress import amount
+
+_LOOKED_AT = 8  # lightings that stand for all
 
 
 def describe(source: str, overrides: dict[str, str]) -> str:
@@ -18,8 +21,7 @@ def describe(source: str, overrides: dict[str, str]) -> str:
       source: a configuration, a scene name or a mesh file.
       overrides: of the configuration.
     """
-    from ddprt.lights import Lighting
-    from ddprt.sampling.lightings import draw_lightings
+    from ddprt.dataset.generate import check_points
     from ddprt.scene.files import load_scene
     from ddprt.transport.effects import plan
     from ddprt.transport.embree import Tracer
@@ -47,41 +49,96 @@ def describe(source: str, overrides: dict[str, str]) -> str:
     )
     if any(hidden.values()):
         lines.append("            " + ", ".join(f"{count} {what}" for what, count in hidden.items()) + " by other geometry")
+    if not config.points.file:
+        try:
+            check_points(config, scene, atlas)
+        except UserError as error:
+            lines.append(f"points      cannot be placed as configured: {error}")
     settings = config.lightings
-    lightings: tuple[Lighting, ...] = ()
-    drawn = min(8, settings.train)
-    try:
-        draw = draw_lightings(settings, "train", drawn, bounds=scene.bounds, clearance=tracer.clearance, seed=config.seed)
-        lightings = draw.lightings
-        tried = f"{draw.candidates} positions tried, {draw.rejected} rejected for the first {drawn}"
-        lines.append(f"lightings   {settings.distribution}: {tried}")
-    except UserError as error:  # an asset can be looked at before its lamps are configured
-        lines.append(f"lightings   cannot be drawn as configured: {error}")
+    lightings, told = _some_lightings(config, scene, tracer)
+    lines += told
     for effect in plan(scene, lightings, bounces=config.transport.bounces).effects:
+        if not lightings and effect.name.endswith(" lights"):
+            continue  # nobody knows
         state = "called for" if effect.called else "left out"
         most = "any amount" if effect.bound is None else f"{effect.bound:.2g}"
         bound = "" if effect.called else f"; at most {most} of the direct light"
         lines.append(f"effect      {effect.name}: {state}{' (forced)' if effect.forced else ''}: {effect.why}{bound}")
     count = settings.train + settings.validation + settings.test
     shadow = atlas.count * config.transport.direct_samples * count
-    lines.append(f"a bake      {count} lightings: {shadow / 1e6:.0f} M shadow rays per lamp")
-    if lightings and plan(scene, lightings, bounces=config.transport.bounces).bounces:
-        lines += _gathering(config, tracer, atlas, lightings)
+    lines.append(f"a bake      {count} lightings: {amount(shadow)} shadow rays per lamp")
+    if not lightings:
+        return "\n".join(lines)
+    direct = _direct(config, tracer, atlas, lightings)
+    lines += _darkness(lightings, direct, scene, tracer)
+    if any(light.any() for light in direct) and plan(scene, lightings, bounces=config.transport.bounces).bounces:
+        lines += _gathering(config, tracer, atlas, lightings, direct)
     return "\n".join(lines)
 
 
-def _gathering(config: Config, tracer: Any, atlas: Any, lightings: Any) -> list[str]:
-    """What the operator would choose for these lightings."""
+def _some_lightings(config: Config, scene: Any, tracer: Any) -> tuple[Any, list[str]]:
+    """A few lightings as configured, and what to say; where a room has no free space, lamps about it as an asset."""
+    from ddprt.lights import load_lightings
+    from ddprt.sampling.lightings import draw_lightings
+
+    settings = config.lightings
+    if settings.file:
+        listed = load_lightings(settings.file)
+        return listed[:_LOOKED_AT], [
+            f"lightings   {settings.file}: {len(listed)}, of which the first {_LOOKED_AT} are looked at"
+        ]
+    drawn = min(_LOOKED_AT, settings.train)
+
+    def draw(**changes: Any) -> Any:
+        changed = settings.model_copy(update=changes)
+        return draw_lightings(changed, "train", drawn, bounds=scene.bounds, clearance=tracer.clearance, seed=config.seed)
+
+    try:
+        found = draw()
+    except UserError as error:  # an asset can be looked at before its lamps are configured
+        try:
+            draw(clearance=0.0, size=1e-9, region_low=(0.0,) * 3, region_high=(1.0,) * 3)
+        except UserError:
+            return draw(distribution="around").lightings, [
+                "lightings   cannot be drawn as configured: got no free space for lamps inside the bounding box, as with a "
+                'closed solid or a flat sheet; set lightings.distribution = "around", as is assumed below'
+            ]
+        return (), [f"lightings   cannot be drawn as configured: {str(error).removeprefix('lightings: ')}"]
+    tried = f"{found.candidates} positions tried, {found.rejected} rejected for the first {drawn}"
+    return found.lightings, [f"lightings   {settings.distribution}: {tried}"]
+
+
+def _direct(config: Config, tracer: Any, atlas: Any, lightings: Any) -> list[np.ndarray]:
+    """Direct light of each lighting on the texels."""
     from ddprt.transport.direct import centred, mean_irradiance, on_texels
+
+    places = on_texels(tracer, atlas, config.transport.direct_samples, seeds.stream(config.seed, "texel positions"))
+    return [
+        mean_irradiance(tracer, centred(tracer, lighting), places, seeds.stream(config.seed, "direct", index))
+        for index, lighting in enumerate(lightings)
+    ]
+
+
+def _darkness(lightings: Any, direct: list[np.ndarray], scene: Any, tracer: Any) -> list[str]:
+    """How many lightings light nothing, and why the first of them does not."""
+    from ddprt.dataset.splits import doubt
+
+    dark = [index for index, light in enumerate(direct) if not light.any()]
+    if not dark:
+        return []
+    refused = "; a bake where all do is refused" if len(dark) == len(direct) else ""
+    advice = 'check where fronts look, or set lightings.distribution = "around" for an asset'
+    why = doubt(lightings[dark[0]], True, scene, tracer).removeprefix("lights nothing: ")
+    told = f"{len(dark)} of {len(direct)} lightings light nothing{refused}; the first {why.removeprefix('it ')}; {advice}"
+    return [f"            {told}"]
+
+
+def _gathering(config: Config, tracer: Any, atlas: Any, lightings: Any, direct: list[np.ndarray]) -> list[str]:
+    """What the operator would choose for these lightings."""
     from ddprt.transport.effort import choose_rays
     from ddprt.transport.operator import Operator
 
     operator = Operator.of(tracer, atlas, config.transport.sender_resolution)
-    places = on_texels(tracer, atlas, config.transport.direct_samples, seeds.stream(config.seed, "texel positions"))
-    direct = [
-        mean_irradiance(tracer, centred(tracer, lighting), places, seeds.stream(config.seed, "direct", index))
-        for index, lighting in enumerate(lightings)
-    ]
     averaged = np.concatenate([operator.averaged(light) for light in direct], 1)
     lines = []
     for name, held_out in (("training", False), ("held-out", True)):
@@ -90,8 +147,8 @@ def _gathering(config: Config, tracer: Any, atlas: Any, lightings: Any) -> list[
         near = operator.near(lightings, averaged, bounces=config.transport.bounces)
         facts = choose_rays(operator, radiosity, config.transport, near=near, held_out=held_out, **address).facts
         rays, noise = facts["samples"], 100 * facts["noise_expected"]
-        total = rays * atlas.count / 1e6
-        lines.append(f"            {name} maps: {rays:g} gather rays per texel ({total:.0f} M), noise about {noise:.2g} %")
+        total = amount(rays * atlas.count)
+        lines.append(f"            {name} maps: {rays:g} gather rays per texel ({total}), noise about {noise:.2g} %")
     return lines
 
 

@@ -1,12 +1,27 @@
-"""Progress with an ETA on a terminal, plain heartbeat lines elsewhere."""
+"""Progress with an ETA on a terminal, plain heartbeat lines elsewhere; warnings that reach the user even where it is hidden."""
 
 import sys
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 _HEARTBEAT = 10.0  # seconds between lines where no terminal is
+
+
+class Doubt(UserWarning):
+    """Something in a result that its user should know; `ddprt` says it as one line, in Python it is an ordinary warning."""
+
+
+def amount(count: float) -> str:
+    """A count in the unit that suits it, to two digits or three: "312", "4.1 k", "27 M", "1.5 G"."""
+    size, unit = float(count), ""
+    for larger in ("k", "M", "G", "T"):
+        if size < 999.5:
+            break
+        size, unit = size / 1000, f" {larger}"
+    return f"{size:.0f}{unit}" if size >= 99.5 or not unit else f"{size:.2g}{unit}"
 
 
 class Progress:
@@ -19,6 +34,7 @@ class Progress:
     def __init__(self, quiet: bool = False) -> None:
         self.quiet = quiet
         self.stages: list[dict[str, float | int | str]] = []
+        self._warned: set[str] = set()
 
     @contextmanager
     def stage(self, name: str, total: int = 0) -> Iterator["Stage"]:
@@ -35,6 +51,16 @@ class Progress:
         if not self.quiet:
             print(line, file=sys.stderr, flush=True)
 
+    def warn(self, line: str) -> None:
+        """Something to mend or to know, said once: a line like the others, or a `Doubt` where nothing is shown."""
+        if line in self._warned:
+            return
+        self._warned.add(line)
+        if self.quiet:
+            warnings.warn(line, Doubt, stacklevel=2)
+        else:
+            self.say(f"warning: {line}")
+
 
 class Stage:
     """One stage that is under way; see `Progress.stage`.
@@ -49,7 +75,8 @@ class Stage:
         self.seconds = 0.0
         self._live: Any = None
         self._quiet = quiet
-        self._spoken = self._start = time.perf_counter()
+        self._spoken = self._start = self._paced = time.perf_counter()
+        self._made = self._shown = 0  # steps that took time since `_paced`; steps that the terminal shows
 
     def __enter__(self) -> "Stage":
         if not self._quiet and sys.stderr.isatty():
@@ -68,16 +95,30 @@ class Stage:
             self._live.start()
         return self
 
-    def advance(self, steps: int = 1) -> None:
-        """Notes finished steps."""
-        self.done += steps
+    def pace(self, total: int) -> None:
+        """So many steps in all, and the next one is the first that tells how long one takes: pilots are no steps.
+
+        Args:
+          total: of the whole stage, in the unit of `advance`.
+        """
+        self.total, self._paced, self._made = total, time.perf_counter(), 0
         if self._live is not None:
-            self._live.advance(self._task, steps)
+            self._live.update(self._task, total=total)
+
+    def advance(self, steps: int = 1, *, found: bool = False) -> None:
+        """Notes finished steps; those that an earlier run left (`found`) do not tell how long one takes."""
+        self.done += steps
+        self._made += 0 if found else steps
+        if self._live is not None:
+            if not found:  # what was found rides with the first step that is made, which rich takes for a start, not for speed
+                self._live.advance(self._task, self.done - self._shown)
+                self._shown = self.done
         elif not self._quiet and time.perf_counter() - self._spoken > _HEARTBEAT:
             self._spoken = time.perf_counter()
-            elapsed = self._spoken - self._start
-            left = f", about {elapsed * (self.total - self.done) / self.done:.0f} s left" if self.done and self.total else ""
-            print(f"{self.name}: {self.done} of {self.total} after {elapsed:.0f} s{left}", file=sys.stderr, flush=True)
+            rate = (self._spoken - self._paced) / self._made if self._made else 0.0
+            left = f", about {rate * (self.total - self.done):.0f} s left" if rate and self.total else ""
+            counts = f"{amount(self.done)} of {amount(self.total)}"
+            print(f"{self.name}: {counts} after {self._spoken - self._start:.0f} s{left}", file=sys.stderr, flush=True)
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.seconds = time.perf_counter() - self._start

@@ -54,7 +54,7 @@ FAULTS = {
     "falling region": (
         "[lightings]\nregion_low = [0.5, 0, 0]\nregion_high = [0.4, 1, 1]\n",
         {},
-        ["lightings", "x runs from 0.5"],
+        ["lightings.region_low: got 0.5 for x", "less than 0.4"],
     ),
     "zero lightings": ("[lightings]\ntrain = 0\n", {}, ["lightings.train", "got 0", "greater than or equal to 1"]),
     "no kinds": ("[lightings]\nkinds = []\n", {}, ["lightings.kinds", "got []"]),

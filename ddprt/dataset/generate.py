@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ddprt import __version__, seeds
-from ddprt.config import Config
+from ddprt.config import Config, checked
 from ddprt.dataset import store
 from ddprt.dataset.denoise import find_denoiser
 from ddprt.dataset.indirect import IndirectBake
@@ -65,8 +65,11 @@ def bake(
     Returns:
       The finished dataset.
     Raises:
-      UserError: no lightings, all of them dark, too many points, a folder that holds another dataset, or a configuration
-        together with one of the settings that it replaces.
+      UserError: no lightings, all of them dark, too many points, a folder that holds another dataset, a setting out of its
+        range, or a configuration together with one of the settings that it replaces.
+    Warns:
+      Doubt: lamps that light nothing, light that does not die away, noise that is not reached; where progress is shown, these
+        are lines of it.
     """
     given = {
         name: value for name, value in (("resolution", resolution), ("samples", samples), ("seed", seed)) if value is not None
@@ -75,7 +78,7 @@ def bake(
         rays = given.get("samples", "auto")
         transport = {"samples": rays, "test_samples": rays if rays == "auto" else 2 * rays}
         atlas = {"resolution": given.get("resolution", 256)}
-        config = Config.model_validate({"seed": given.get("seed", 0), "atlas": atlas, "transport": transport})
+        config = checked({"seed": given.get("seed", 0), "atlas": atlas, "transport": transport})
     elif given:
         raise UserError(f"bake: got {' and '.join(given)} beside a config, expected one or the other; set it in the config")
     keep_alive = tempfile.TemporaryDirectory(prefix="ddprt-") if out is None else None
@@ -105,6 +108,20 @@ def other_settings(description: dict[str, Any], config: Config, scene: Scene) ->
     return [name for name, value in wanted.items() if description.get(name) != value]
 
 
+def check_points(config: Config, scene: Scene, atlas: Atlas) -> None:
+    """Makes sure that there are as many texels as points to distribute.
+
+    Raises:
+      UserError: there are fewer.
+    """
+    count = config.points.count
+    if count > atlas.count:
+        raise UserError(
+            f'points.count: got {count}, but "{scene.name}" covers {atlas.count} texels; '
+            "lower points.count or raise atlas.resolution"
+        )
+
+
 class _Bake:
     """One bake from start to end; every stage skips what the manifest already holds."""
 
@@ -119,6 +136,10 @@ class _Bake:
             entries, drawn = choose_lightings(given, self.config.lightings, self.scene, self.tracer, self.config.seed)
             stage.facts |= {"lightings": len(entries), **drawn}
         effects = plan(self.scene, [lighting for _, lighting in entries], bounces=self.config.transport.bounces)
+        if self.config.transport.integrator in ("paths", "reference"):  # the operator tells what it left out, if anything
+            for effect in effects.effects:
+                if effect.bound is None and not effect.forced:
+                    self.progress.warn(f"{effect.name}: {effect.why}")
         with self.progress.stage("atlas") as stage:
             settings = self.config.atlas
             atlas, hidden = build_open_atlas(self.tracer, self.scene, settings.resolution, settings.padding)
@@ -173,13 +194,12 @@ class _Bake:
         if config.file:
             samples = load_samples(config.file)
             if len(samples.position) < config.count:
-                raise UserError(f"points.count: got {config.count}, but {config.file} has {len(samples.position)}")
-        else:
-            if config.count > atlas.count:
                 raise UserError(
-                    f'points.count: got {config.count}, but "{self.scene.name}" covers {atlas.count} texels; '
-                    "lower points.count or raise atlas.resolution"
+                    f"points.count: got {config.count}, but {config.file} has {len(samples.position)}; "
+                    "lower points.count or list more points"
                 )
+        else:
+            check_points(self.config, self.scene, atlas)
             count = config.count * config.supersample
             samples = place_samples(self.scene, count, on=config.on, seed=self.config.seed, atlas=atlas)
         return samples
@@ -268,4 +288,4 @@ class _Bake:
             )
         if faults:
             more = f"; and {len(faults) - _NAMED} more" if len(faults) > _NAMED else ""
-            self.progress.say(f"warning: {len(faults)} doubtful lightings: {'; '.join(faults[:_NAMED])}{more}")
+            self.progress.warn(f"{len(faults)} doubtful lightings: {'; '.join(faults[:_NAMED])}{more}")

@@ -1,13 +1,14 @@
 """Indirect lightmaps of a dataset: by the operator or by shared paths for all lightings at once, or one by one."""
 
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ddprt import seeds
-from ddprt.axes import Float32
+from ddprt.axes import Float32, Int
 from ddprt.config import Config
 from ddprt.dataset.denoise import denoised
 from ddprt.dataset.scratch import Scratch
@@ -68,6 +69,7 @@ class IndirectBake:
         operator = Operator.of(self.tracer, self.atlas, config.sender_resolution)
         lightings = [self.dataset.lightings[index] for index in indices]
         parts, rays, footprints = [], None, None
+        begun = time.perf_counter()
         for half in range(len(kinds)):
             stream = f"{split} {half}"
             direct = self._averaged(operator, indices, half)
@@ -75,19 +77,37 @@ class IndirectBake:
             near = operator.near(lightings, direct, bounces=self.effects.bounces)
             address: dict[str, Any] = {"seed": self.config.seed, "stream": stream, "near": near}
             if rays is None:
+                bouncing = time.perf_counter() - begun
                 chosen = choose_rays(operator, bounced.radiosity, config, held_out=test, **address)
                 rays, footprints = chosen.rays, chosen.footprints
                 stage.facts |= chosen.facts | self._facts(bounced, operator)
+                spent = time.perf_counter() - begun + (len(kinds) - 1) * bouncing  # each half bounces its own light
+                stage.facts["seconds_expected"] = float(f"{chosen.facts['seconds_expected'] + spent:.2g}")
+                stage.pace(len(kinds) * int(rays.sum()))
                 given, expected = config.test_samples if test else config.samples, chosen.facts["noise_expected"]
                 if given == "auto" and expected > 1.5 * config.target_noise:
-                    self.progress.say(
-                        f"warning: transport.target_noise: got {config.target_noise:g}, but the most rays that are traced "
+                    self.progress.warn(
+                        f"transport.target_noise: got {config.target_noise:g}, but the most rays that are traced "
                         f"unasked leave {expected:.2g}; raise it, or set transport.{'test_' if test else ''}samples"
                     )
             scratch = self._scratch(split, half, indices, rays=seeds.digest(rays))
-            scratch.follow(operator.gather(bounced.radiosity, scratch.maps, rays, skip=scratch.done, **address), stage.advance)
+            self._follow(
+                scratch, operator.gather(bounced.radiosity, scratch.maps, rays, skip=scratch.done, **address), stage, rays
+            )
             parts.append(scratch)
         self._finish(parts, indices, todo, kinds, footprints.pooled if footprints else lambda light: light)
+
+    def _follow(self, scratch: Scratch, tiles: Iterator[int], stage: Stage, rays: Int[np.ndarray, " texels"]) -> None:
+        """Follows tiles of texels; a step is a ray, since texels with few rays come first and tell little about the others."""
+        upto = np.concatenate([[0], np.cumsum(np.sort(rays[rays > 0]))])
+        texel, tile, there = 0, 0, scratch.done
+
+        def told(texels: int) -> None:
+            nonlocal texel, tile
+            stage.advance(int(upto[texel + texels] - upto[texel]), found=tile < there)
+            texel, tile = texel + texels, tile + 1
+
+        scratch.follow(tiles, told)
 
     def _scratch(self, split: str, half: int, indices: list[int], **rays: int) -> Scratch:
         """Where a half of a split's maps is made."""
@@ -117,8 +137,8 @@ class IndirectBake:
         """What the series left out; said aloud where that matters."""
         remainder = f"{bounced.remainder:.2g}" if np.isfinite(bounced.remainder) else "unbounded"
         if self.effects.bounces < 0 and not bounced.converged:
-            self.progress.say(
-                f"warning: light was followed for {bounced.bounces} bounces and has not died away (bound on the rest: "
+            self.progress.warn(
+                f"light was followed for {bounced.bounces} bounces and has not died away (bound on the rest: "
                 f"{remainder} of each lighting's peak); lower the largest albedo"
             )
         return {"bounces": bounced.bounces, "senders": operator.senders.count, "remainder": remainder}
@@ -148,17 +168,18 @@ class IndirectBake:
             given, noise = choose_samples(*scene, target=config.target_noise, stream=stream, **shared)
             stage.facts["noise_expected"] = float(f"{noise:.3g}")
             if noise > 1.5 * config.target_noise:
-                self.progress.say(
-                    f"warning: {given} paths per texel leave about {100 * noise:.2g} % of noise, and no more are traced "
+                self.progress.warn(
+                    f"{given} paths per texel leave about {100 * noise:.2g} % of noise, and no more are traced "
                     "unasked; set transport.samples, raise transport.target_noise, or use the operator"
                 )
         samples = max(1, given // halves)
         stage.facts["samples"] = samples * halves
-        parts = []
+        parts, paths = [], np.full(self.atlas.count, samples)
+        stage.pace(halves * int(paths.sum()))
         for half in range(halves):
             scratch = self._scratch(split, half, indices, paths=samples)
             address: dict[str, Any] = {"samples": samples, "stream": f"{stream} {half}", **shared}
-            scratch.follow(trace_paths(*scene, scratch.maps, skip=scratch.done, **address), stage.advance)
+            self._follow(scratch, trace_paths(*scene, scratch.maps, skip=scratch.done, **address), stage, paths)
             parts.append(scratch)
         self._finish(parts, indices, todo, kinds, lambda light: light)
 

@@ -1,5 +1,6 @@
 """How many rays each texel gets: as many as a target for the noise asks, and more where they are needed."""
 
+import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +15,7 @@ from ddprt.transport.operator import Operator
 
 _PILOT = 8  # rays of every texel that tell distances and variances, and are thrown away
 _PROBED = 1024  # texels whose noise is measured
-_TIMED = 1024  # texels that tell how long a ray takes
+_TIMED = 512  # texels that tell each thread how long a ray takes
 _LIGHTINGS = 32  # that are looked at
 _FEW, _MANY = 24, 96  # rays there, twice each; no powers of two, which do 10 % better than what lies between
 _WIDE = 0.4  # of the harmonic mean distance: over how far variances seen by few rays are averaged
@@ -30,7 +31,7 @@ class Choice:
     Attributes:
       rays: of each texel.
       footprints: neighbours that share rays; None where none do.
-      facts: mean rays, expected relative RMSE of the maps, seconds at the pilot's rate, variance over that of an even share.
+      facts: mean rays, expected relative RMSE of the maps, seconds of the gather, variance over that of an even share.
     """
 
     rays: Int[np.ndarray, " texels"]
@@ -64,7 +65,7 @@ def choose_rays(
     halves, samples = (2, config.test_samples) if held_out else (1, config.samples)
     footprint, adaptive = (0.0, False) if held_out else (config.footprint, config.adaptive)
     area = operator.atlas.area
-    each = operator.seconds_per_ray(radiosity, _MANY, _TIMED)
+    each = _seconds_per_ray(operator, radiosity, near)
     lightings = radiosity.shape[1] // 3
     chosen = np.unique(np.linspace(0, lightings - 1, min(lightings, _LIGHTINGS)).astype(int))  # enough to tell what is needed
     radiosity, near = columns_of(radiosity, chosen), near.some(chosen) if near else None
@@ -88,6 +89,23 @@ def choose_rays(
     if adaptive:
         facts["variance_over_even"] = round(ratio, 3)
     return Choice(rays, footprints, facts)
+
+
+def _seconds_per_ray(operator: Operator, radiosity: Float32[np.ndarray, "senders columns"], near: NearField | None) -> float:
+    """How long a ray takes on all threads together, with all lightings and with what near senders cost.
+
+    Each thread gathers for texels of its own: a few tiles shared out between many threads would leave most of them idle.
+    """
+    threads = operator.tracer.threads
+    texels = np.unique(np.linspace(0, operator.atlas.count - 1, _TIMED).astype(int))
+
+    def work(thread: int) -> int:
+        operator.gather_some(radiosity, texels, _MANY, seed=thread, stream="rate", near=near)
+        return len(texels) * _MANY
+
+    begun = time.perf_counter()
+    rays = sum(operator.tracer.map(work, range(threads)))
+    return (time.perf_counter() - begun) / rays
 
 
 def allot(
