@@ -14,7 +14,7 @@ class Doubt(UserWarning):
     """Something in a result that its user should know; `ddprt` says it as one line, in Python it is an ordinary warning."""
 
 
-def amount(count: float) -> str:
+def amount(count: float | int) -> str:
     """A count in the unit that suits it, to two digits or three: "312", "4.1 k", "27 M", "1.5 G"."""
     size, unit = float(count), ""
     for larger in ("k", "M", "G", "T"):

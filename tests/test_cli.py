@@ -173,6 +173,7 @@ def test_each_fault_is_one_line_and_exit_code_2(
     error = capsys.readouterr().err
     lines = [line for line in error.splitlines() if line.startswith("ddprt: ")]
     assert len(lines) == 1, error
+    assert "; " in lines[0] or "did you mean" in lines[0] or "known: " in lines[0], "what to do"
     assert expected in lines[0]
     assert "Traceback" not in error
     assert {path: path.read_bytes() for path in done.rglob("*") if path.is_file()} == before, "earlier results are untouched"
@@ -292,6 +293,131 @@ def test_heartbeat_without_a_terminal(capsys: pytest.CaptureFixture, monkeypatch
     lines = capsys.readouterr().err.splitlines()
     assert any("baking: 2 of 4" in line and "s left" in line for line in lines)
     assert progress.stages[0]["name"] == "baking"
+
+
+def test_neither_a_pilot_nor_what_was_found_done_sets_the_pace(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A pilot of an hour, 500 steps that an earlier run left, then 11 s a step: 11 * 499 s are left after the first."""
+    from ddprt.progress import Progress
+
+    now = 0.0
+    monkeypatch.setattr(time, "perf_counter", lambda: now)
+    with Progress().stage("baking", 7) as stage:
+        now += 3600
+        stage.pace(1000)
+        stage.advance(500, found=True)
+        now += 11
+        stage.advance()
+    assert "baking: 501 of 1 k after 3611 s, about 5489 s left" in capsys.readouterr().err
+
+
+def test_a_terminal_shows_the_same_pace(monkeypatch: pytest.MonkeyPatch) -> None:
+    """rich takes the first sample for the start: what was found must lie in it, and nothing else."""
+    from rich.progress import Progress as Bar
+
+    from ddprt.progress import Progress
+
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    seen: list[float] = []
+    monkeypatch.setattr(Bar, "advance", lambda self, task, steps: seen.append(steps))
+    with Progress().stage("baking", 7) as stage:
+        stage.pace(1000)
+        stage.advance(300, found=True)
+        stage.advance(200, found=True)
+        stage.advance(2)
+        stage.advance(3)
+        assert stage._live.tasks[0].total == 1000
+        stage._live.tasks[0].total = 505
+    assert seen == [502, 3]
+
+
+@pytest.mark.parametrize(
+    ("count", "text"),
+    [
+        (0, "0"), (7, "7"), (999, "999"), (1000, "1 k"), (4096, "4.1 k"), (45056, "45 k"), (99_499, "99 k"), (314_159, "314 k"),
+        (999_499, "999 k"), (999_500, "1 M"), (27e6, "27 M"), (1.5e9, "1.5 G"), (2e12, "2 T"), (3e16, "30000 T"),
+    ],
+)  # fmt: skip
+def test_counts_are_told_in_the_unit_that_suits_them(count: float, text: str) -> None:
+    from ddprt.progress import amount
+
+    assert amount(count) == text
+
+
+def mesh(path: Path, corners: list, faces: list) -> str:
+    lines = [f"v {x} {y} {z}" for x, y, z in corners] + ["f " + " ".join(str(corner + 1) for corner in face) for face in faces]
+    path.write_text("\n".join(lines))
+    return str(path)
+
+
+SQUARE = [(0, 0, 0), (1, 0, 0), (1, 0, -1), (0, 0, -1)]
+
+
+def test_inspect_of_a_small_scene_counts_its_rays(capsys: pytest.CaptureFixture) -> None:
+    assert call("inspect", "plates", "--atlas.resolution", "8", "--points.count", "8") == 0
+    text = capsys.readouterr().out
+    # 8 texels, 4 shadow rays on each, 176 lightings.
+    assert "8 texels covered" in text
+    assert "176 lightings: 5.6 k shadow rays per lamp" in text
+    assert "(0 M)" not in text
+    assert "points " not in text
+    assert call("inspect", "plates", "--atlas.resolution", "8") == 0
+    assert 'points      cannot be placed as configured: points.count: got 128, but "plates" covers 8' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("source", ["convex", "sheet"])
+def test_inspect_of_what_has_no_free_space_assumes_lamps_about_it(
+    source: str, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    name = mesh(tmp_path / "sheet.obj", SQUARE, [(0, 1, 2, 3)]) if source == "sheet" else source
+    assert call("inspect", name, "--atlas.resolution", "32") == 0
+    text = capsys.readouterr().out
+    assert 'set lightings.distribution = "around", as is assumed below' in text
+    assert "point lights: called for: 8 of 8 lightings" in text
+    assert "lower lightings.clearance" not in text
+
+
+def test_inspect_tells_lamps_that_light_nothing(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """A triangle's bounding box is flat: lamps in it stand in its plane."""
+    name = mesh(tmp_path / "one.obj", SQUARE[:2] + SQUARE[3:], [(0, 1, 2)])
+    assert call("inspect", name, "--atlas.resolution", "32") == 0
+    assert "8 of 8 lightings light nothing; a bake where all do is refused; the first faces away" in capsys.readouterr().out
+    assert call("inspect", "cornell", "--atlas.resolution", "32") == 0
+    assert "light nothing" not in capsys.readouterr().out
+
+
+def test_inspect_says_what_is_too_wide_a_berth(capsys: pytest.CaptureFixture) -> None:
+    assert call("inspect", "cornell", "--atlas.resolution", "32", "--lightings.clearance", "9") == 0
+    text = capsys.readouterr().out
+    assert "lower lightings.clearance" in text
+    assert '"around"' not in text
+    assert "point lights" not in text, "without a lighting nobody knows"
+
+
+def test_inspect_looks_at_the_lightings_that_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    listed = tmp_path / "lights.json"
+    listed.write_text(json.dumps([[{"type": "directional", "direction": [0, -1, 0], "irradiance": [1, 1, 1]}]]))
+    assert call("inspect", "plates", "--atlas.resolution", "16", "--lightings.file", listed) == 0
+    text = capsys.readouterr().out
+    assert "directional lights: called for: 1 of 1 lightings" in text
+    assert "point lights: left out" in text
+
+
+WHITE = ["--scene.name", "furnace", "--scene.parameters.albedo", "1", "--scene.parameters.subdivisions", "2"]
+
+
+def test_light_that_never_dies_is_said_once_even_when_quiet(job: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    assert call("bake", job, "--out", tmp_path / "run", "--quiet", *WHITE) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert len([line for line in lines if line.startswith("warning: light was followed for 512 bounces")]) == 1, lines
+    assert all(line.startswith("warning: ") for line in lines), "no progress, and no line of code"
+
+
+def test_the_smallest_atlas_works_where_its_charts_fit(job: Path, tmp_path: Path) -> None:
+    small = ["--scene.name", "plates", "--atlas.resolution", "8", "--quiet"]
+    assert call("bake", job, "--out", tmp_path / "run", *small) == 0
+    assert call("fit", job, "--out", tmp_path / "run", *small) == 0
 
 
 def test_configuration_of_a_run_is_plain_toml(done: Path) -> None:

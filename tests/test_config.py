@@ -56,6 +56,25 @@ FAULTS = {
         {},
         ["lightings.region_low: got 0.5 for x", "less than 0.4"],
     ),
+    "not TOML, what to do": ("[fit\n", {}, ["got text that is not TOML", "expected [section]", "; mend it"]),
+    "too small": ("[atlas]\nresolution = 4\n", {}, ["atlas.resolution: got 4", "equal to 8; raise it"]),
+    "too large": ("[atlas]\npadding = 65\n", {}, ["atlas.padding: got 65", "equal to 64; lower it"]),
+    "one of two kinds of value": (
+        "[transport]\nsamples = 0\n",
+        {},
+        ["transport.samples: got 0, expected 'auto' or greater", "; raise it"],
+    ),
+    "a wrong type": ('[fit]\ncentre = 3\nbases = "x"\n', {}, ["fit.bases: got 'x'", "leave it out for the default, 16"]),
+    "a far word": ('[fit]\nspace = "q"\n', {}, ["fit.space: got 'q'", 'leave it out for the default, "linear"']),
+    "a list that is too short": (
+        "[lightings]\ndistance = [1.0]\n",
+        {},
+        ["distance", "leave it out for the default, [1.5, 3.0]"],
+    ),
+    "saturation": ("[lightings]\nsaturation = [0.5, 1.5]\n", {}, ["lightings.saturation: got [0.5, 1.5]", "; move them"]),
+    "cone": ("[lightings]\nspot_outer_deg = [9, 90]\n", {}, ["lightings.spot_outer_deg: got [9, 90]", "; move them"]),
+    "no lights": ("[lightings]\nlights = [0, 1]\n", {}, ["lightings.lights: got 0", "at least 1; raise it"]),
+    "falling override": ("", {"lightings.intensity": "[2, 1]"}, ["--lightings.intensity: got [2, 1]", "; swap them"]),
     "zero lightings": ("[lightings]\ntrain = 0\n", {}, ["lightings.train", "got 0", "greater than or equal to 1"]),
     "no kinds": ("[lightings]\nkinds = []\n", {}, ["lightings.kinds", "got []"]),
     "a section as a number": ("fit = 3\n", {}, ["fit", "got 3"]),
@@ -78,6 +97,9 @@ def test_each_fault_is_one_line(name: str, tmp_path: Path) -> None:
     assert "\n" not in message
     assert all(part in message for part in expected), message
     assert "job.toml" in message or "--" in message
+    got, _, remedy = message.rpartition("; ")
+    assert got, f"no word on what to do: {message}"
+    assert remedy
 
 
 @pytest.mark.parametrize("name", ["nothing.toml", ""])

@@ -327,6 +327,97 @@ def test_a_noise_out_of_reach_is_said(cornell: Scene, monkeypatch: pytest.Monkey
     assert "transport.test_samples" not in words
 
 
+def test_a_setting_out_of_range_is_one_line(cornell: Scene) -> None:
+    with pytest.raises(UserError, match=r"^configuration: atlas\.resolution: got 4, expected .* equal to 8; raise it$"):
+        bake(cornell, resolution=4)
+
+
+WHITE = {"train": ((0.1, 0.1, 0.0),), "validation": ((0.1, 0.0, 0.1),), "test": ((0.0, 0.1, 0.1),)}
+
+
+@pytest.mark.parametrize(
+    ("integrator", "words"),
+    [("operator", "light was followed for 512 bounces"), ("paths", "diffuse bounces: largest albedo 1")],
+)
+def test_a_library_warns_once_and_never_prints(
+    integrator: str, words: str, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from ddprt.progress import Doubt
+    from ddprt.scene.library import build
+
+    given = {split: lightings(*[{**LAMP, "position": place} for place in places]) for split, places in WHITE.items()}
+    room = build("furnace", albedo=1.0, subdivisions=1)
+    config = small(points={"count": 4}, transport={"samples": 2, "test_samples": 2, "integrator": integrator, "threads": 2})
+    with pytest.warns(Doubt) as caught:
+        bake(room, given, config=config)
+    doubts = [str(entry.message) for entry in caught if entry.category is Doubt]
+    assert [doubt.startswith(words) for doubt in doubts] == [True], [(entry.category, str(entry.message)) for entry in caught]
+    assert capsys.readouterr() == ("", "")
+
+
+def test_doubtful_lightings_reach_a_quiet_caller(cornell: Scene) -> None:
+    from ddprt.progress import Doubt
+
+    given = {"train": lightings(LAMP, OFF), "validation": lightings(LAMP), "test": lightings(LAMP)}
+    with pytest.warns(Doubt, match="1 doubtful lightings: 1 .train.: lights nothing: it has no intensity"):
+        bake(cornell, given, config=small())
+
+
+@pytest.mark.parametrize("near", [0.0, 3.0])
+def test_the_seconds_that_were_expected_are_those_it_takes(
+    near: float, cornell: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A clock that only rays and bounces move: a ray costs 1 ms, `near` ms more where it may meet near senders."""
+    from ddprt.transport.operator import Operator
+
+    now = 0.0
+    gather, some, bounce = Operator.gather, Operator.gather_some, Operator.bounce
+
+    def costs(rays: int, address: dict) -> None:
+        nonlocal now
+        now += rays * (1 + (near if address.get("near") else 0)) / 1000
+
+    def gathered(self: Operator, radiosity: np.ndarray, out: np.ndarray, rays: np.ndarray, **address: object):
+        yield from gather(self, radiosity, out, rays, **address)
+        costs(int(rays.sum()), address)
+
+    def some_gathered(self: Operator, radiosity: np.ndarray, texels: np.ndarray, samples: int, **address: object) -> np.ndarray:
+        costs(len(texels) * samples, address)
+        return some(self, radiosity, texels, samples, **address)
+
+    def bounced(self: Operator, *given: object, **address: object) -> object:
+        nonlocal now
+        now += 200.0
+        return bounce(self, *given, **address)
+
+    for name, instead in (("gather", gathered), ("gather_some", some_gathered), ("bounce", bounced)):
+        monkeypatch.setattr(Operator, name, instead)
+    monkeypatch.setattr(time, "perf_counter", lambda: now)
+    progress = Progress(quiet=True)
+    bake(cornell, config=small(transport={"samples": 512, "test_samples": 2048, "threads": 1}), progress=progress)
+    stages = [stage for stage in progress.stages if "seconds_expected" in stage]
+    assert [stage["name"] for stage in stages] == ["indirect train", "indirect test"]
+    for stage in stages:  # said in two digits: half a unit of the second is at most 5 % of the whole
+        assert stage["seconds_expected"] == pytest.approx(stage["seconds"], rel=0.05)
+
+
+def test_a_bake_paces_itself_by_rays(cornell: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every ray is a step, of this run or found done; texels with few rays come first and count for less."""
+    from ddprt.progress import Stage
+
+    paced: list[int] = []
+    steps: list[int] = []
+    pace, advance = Stage.pace, Stage.advance
+    monkeypatch.setattr(Stage, "pace", lambda self, total: (paced.append(total), pace(self, total))[1])
+    monkeypatch.setattr(Stage, "advance", lambda self, n=1, **how: (steps.append(n), advance(self, n, **how))[1])
+    progress = Progress(quiet=True)
+    data = bake(cornell, config=small(transport={"samples": 64, "test_samples": 128}), progress=progress)
+    facts = [stage for stage in progress.stages if "variance_over_even" in stage or "samples" in stage][-2:]
+    texels = int(data.covered.sum())
+    assert paced == pytest.approx([stage["samples"] * texels for stage in facts], rel=0.05 / 64 * 2)  # samples: to a tenth
+    assert sum(steps) - len(data.lightings) == sum(paced), "a lighting is a step of direct light"
+
+
 @pytest.mark.parametrize("beside", [{"resolution": 64}, {"samples": 8}, {"seed": 0}, {"resolution": 32, "seed": 1}])
 def test_settings_beside_a_config_are_refused(beside: dict, cornell: Scene) -> None:
     with pytest.raises(UserError, match=f"got {' and '.join(beside)} beside a config"):

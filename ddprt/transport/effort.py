@@ -15,7 +15,7 @@ from ddprt.transport.operator import Operator
 
 _PILOT = 8  # rays of every texel that tell distances and variances, and are thrown away
 _PROBED = 1024  # texels whose noise is measured
-_TIMED = 512  # texels that tell each thread how long a ray takes
+_TIMED = 64, 1088  # texels of each thread: the difference tells how long a ray takes
 _LIGHTINGS = 32  # that are looked at
 _FEW, _MANY = 24, 96  # rays there, twice each; no powers of two, which do 10 % better than what lies between
 _WIDE = 0.4  # of the harmonic mean distance: over how far variances seen by few rays are averaged
@@ -94,18 +94,22 @@ def choose_rays(
 def _seconds_per_ray(operator: Operator, radiosity: Float32[np.ndarray, "senders columns"], near: NearField | None) -> float:
     """How long a ray takes on all threads together, with all lightings and with what near senders cost.
 
-    Each thread gathers for texels of its own: a few tiles shared out between many threads would leave most of them idle.
+    Each thread gathers for texels of its own: a few tiles shared out between many threads would leave most of them idle. What
+    a call costs before its first ray, as much as a hundred thousand rays, is in both sizes and drops out.
     """
-    threads = operator.tracer.threads
-    texels = np.unique(np.linspace(0, operator.atlas.count - 1, _TIMED).astype(int))
+    threads, spent = operator.tracer.threads, []
+    for count in _TIMED:
+        texels = np.linspace(0, operator.atlas.count - 1, count).astype(int)
 
-    def work(thread: int) -> int:
-        operator.gather_some(radiosity, texels, _MANY, seed=thread, stream="rate", near=near)
-        return len(texels) * _MANY
+        def work(thread: int, texels: Int[np.ndarray, " timed"] = texels) -> None:
+            operator.gather_some(radiosity, texels, _MANY, seed=thread, stream="rate", near=near)
 
-    begun = time.perf_counter()
-    rays = sum(operator.tracer.map(work, range(threads)))
-    return (time.perf_counter() - begun) / rays
+        begun = time.perf_counter()
+        for _ in operator.tracer.map(work, range(threads)):
+            pass
+        spent.append(time.perf_counter() - begun)
+    few, many = _TIMED
+    return max(spent[1] - spent[0], 0.1 * spent[1]) / ((many - few) * _MANY * threads)  # a busy machine may turn them around
 
 
 def allot(
