@@ -153,7 +153,9 @@ class Comparison:
         start = time.perf_counter()
         maps = np.stack([self.peer.bake(lighting, paths, index) for index, lighting in enumerate(self.on.train[:count])])
         whole = time.perf_counter() - start
-        compiling = sum(kernel["backend_time"] for kernel in self.peer.dr.kernel_history()) / 1000  # it counts milliseconds
+        compiling = (
+            sum(kernel.get("backend_time", 0) for kernel in self.peer.dr.kernel_history()) / 1000
+        )  # it counts milliseconds
         seconds = (whole - compiling) / count
         relit = {number: self.relit.error(maps[:number]) for number in learn}
         run = Run(paths, seconds, maps[: self.tests])

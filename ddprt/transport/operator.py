@@ -7,7 +7,7 @@ back between their centres within each chart. In the end every receiver adds up 
     E = G b,    b = R (E0 + P (e_1 + e_2 + ...)),    e_1 = G R E0,    e_k+1 = G P R e_k,    all e_k on the coarse blocks
 
 A lighting is a column of these products, so one more costs its shadow rays and a column. Averaging light over a sender is the
-only bias, and near senders, where it would show, are looked at more closely (`transport/near.py`); `experiments/bake_speed.py
+only bias, and near senders, where it would show, are looked at more closely (`transport/near.py`); `experiments/bake_costs.py
 bias` measures what is left against unbiased paths.
 """
 
