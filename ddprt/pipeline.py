@@ -107,14 +107,15 @@ class Run:
         main = models[names[0]]
         report = main.relighter.report
         if report.bases and report.bases < self.config.fit.bases:
-            self.progress.say(
-                f"warning: fit.bases: asked for {self.config.fit.bases}, the data has rank {report.numerical_rank}: "
+            self.progress.warn(
+                f"fit.bases: asked for {self.config.fit.bases}, the data has rank {report.numerical_rank}: "
                 f"{report.bases} are given"
             )
         remarks = {name: model.relighter.report.remarks for name, model in models.items()}
         for remark in worst_first({remark for found in remarks.values() for remark in found}):
             told = ", ".join(name for name, found in remarks.items() if remark in found)
-            self.progress.say(f"{'note' if remark in NOTES else 'warning'}: {told}: {remark}: {STATUSES.get(remark, '')}")
+            line = f"{told}: {remark}: {STATUSES.get(remark, '')}"
+            self.progress.say(f"note: {line}") if remark in NOTES else self.progress.warn(line)
         main.save(self.folder / "model.ddprt")
         write_text(self.folder / "config.toml", self.config.to_toml())
         return models, seconds
@@ -175,7 +176,7 @@ class Run:
             files = export_textures(model, self.folder / "export", **self.config.export.model_dump())
         seams = json.loads(files[-1].read_text())["seams"]
         if self.config.export.stitch and not seams["stitched"]:
-            self.progress.say(f"warning: export.stitch: seams stay open: {seams['why']}")
+            self.progress.warn(f"export.stitch: seams stay open: {seams['why']}")
         return files
 
     def effects(self, data: Dataset) -> Plan:

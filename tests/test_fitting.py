@@ -110,6 +110,8 @@ def test_more_bases_than_rank_gives_fewer_and_says_so() -> None:
     basis = fit_basis(jnp.asarray(data), jnp.ones(30), bases=4)
     assert (basis.rank, len(basis.vectors), basis.status) == (1, 1, "rank_deficient")
     assert fit_basis(jnp.zeros((5, 30)), jnp.ones(30), bases=4).status == "no_signal"
+    equal = fit_basis(jnp.ones((5, 30)), jnp.ones(30), bases=4, centre=True)
+    assert (equal.rank, equal.status) == (0, "rank_deficient"), "the mean is light"
 
 
 def test_rank_is_found_beyond_reach_of_a_float32_gram() -> None:

@@ -168,7 +168,7 @@ def test_the_mesh_that_ended_the_process_is_unwrapped() -> None:
 
 
 def test_patches_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(UserError, match=r"atlas.resolution: got 8, too small for the .* charts"):
+    with pytest.raises(UserError, match=r"atlas.resolution: got 8, expected more for the .* charts"):
         unwrapping._unwrap(sheet("tube", 500, 1), 8, 8)
 
 

@@ -75,8 +75,9 @@ def fit_basis(
         rank = int(np.sum(np.asarray(sigma) > RANK_CUT * float(sigma[0])))
         kept = min(bases, rank)
         vectors, coefficients = _build(columns, weights, mean, sigma[:kept], rotation[:, :kept])
-        status: Status = "no_signal" if rank == 0 else "rank_deficient" if kept < bases else "ok"
         shown = jnp.zeros(columns.shape[1], jnp.float32) if mean is None else mean.astype(jnp.float32)
+        dark = rank == 0 and not np.asarray(shown).any()
+        status: Status = "no_signal" if dark else "rank_deficient" if kept < bases else "ok"
         return Basis(vectors, shown, coefficients, sigma, rank, status)
 
 

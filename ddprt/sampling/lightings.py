@@ -132,7 +132,8 @@ def _free_position(
             return candidates[accepted[0]], tried + int(accepted[0]), tried + int(accepted[0]) + 1
     raise UserError(
         f"lightings: got no free position in {_TRIES} tries, expected free space with {config.clearance + room:g} m around; "
-        "lower lightings.clearance or lightings.size, or widen region_low and region_high"
+        "lower lightings.clearance or lightings.size, widen region_low and region_high, or set lightings.distribution = "
+        '"around" for an asset'
     )
 
 

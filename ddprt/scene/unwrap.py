@@ -69,9 +69,10 @@ def _unwrap(scene: Scene, resolution: int, padding: int) -> tuple[np.ndarray, np
     else:
         best = _bisected(flat, corners, resolution, padding)
     if best is None:
+        remedy = "raise atlas.resolution" + (" or lower atlas.padding" if padding > 1 else "")
         raise UserError(
-            f'atlas.resolution: got {resolution}, too small for the {chart.max() + 1} charts of "{scene.name}" '
-            f"with padding {padding}; raise atlas.resolution or lower atlas.padding"
+            f'atlas.resolution: got {resolution}, expected more for the {chart.max() + 1} charts of "{scene.name}" '
+            f"with padding {padding}; {remedy}"
         )
     return best[corners].astype(np.float64), chart
 

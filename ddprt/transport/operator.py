@@ -11,7 +11,6 @@ only bias, and near senders, where it would show, are looked at more closely (`t
 bias` measures what is left against unbiased paths.
 """
 
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -243,16 +242,6 @@ class Operator:
 
         parts = list(self.tracer.map(work, receivers.tiles(_TOGETHER)))
         return np.concatenate(parts).reshape(len(texels), -1, 3).swapaxes(0, 1) * np.float32(1 / samples)
-
-    def seconds_per_ray(self, radiosity: Float32[np.ndarray, "senders columns"], samples: int, texels: int) -> float:
-        """How long a ray takes with all these lightings on all cores, by a few texels."""
-        chosen = np.unique(np.linspace(0, self.atlas.count - 1, texels).astype(int))
-        receivers, table = Receivers.texels(self.atlas, samples, 0, "rate", chosen), _with_dark_row(radiosity)
-        begun = time.perf_counter()
-        rng = seeds.stream(0, "rate")
-        for _ in self.tracer.map(lambda tile: self._sums(receivers, tile, table, None, rng), receivers.tiles()):
-            pass
-        return (time.perf_counter() - begun) / (samples * len(chosen))
 
     def _sums(
         self,
