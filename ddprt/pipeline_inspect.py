@@ -110,11 +110,11 @@ def _some_lightings(config: Config, scene: Any, tracer: Any) -> tuple[Any, list[
 
 def _direct(config: Config, tracer: Any, atlas: Any, lightings: Any) -> list[np.ndarray]:
     """Direct light of each lighting on the texels."""
-    from ddprt.transport.direct import centred, mean_irradiance, on_texels
+    from ddprt.transport.direct import on_texels, texel_irradiance
 
     places = on_texels(tracer, atlas, config.transport.direct_samples, seeds.stream(config.seed, "texel positions"))
     return [
-        mean_irradiance(tracer, centred(tracer, lighting), places, seeds.stream(config.seed, "direct", index))
+        texel_irradiance(tracer, atlas, lighting, places, seeds.stream(config.seed, "direct", index))
         for index, lighting in enumerate(lightings)
     ]
 

@@ -25,7 +25,7 @@ from ddprt.lights import Lighting
 from ddprt.sampling.lightings import draw_lightings
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
-from ddprt.transport.direct import centred, mean_irradiance, on_texels
+from ddprt.transport.direct import on_texels, texel_irradiance
 from ddprt.transport.effort import choose_rays
 from ddprt.transport.embree import Tracer
 from ddprt.transport.openness import build_open_atlas
@@ -74,7 +74,7 @@ def bake(
     operator = Operator.of(tracer, atlas, transport.sender_resolution)
 
     def direct(index: int) -> np.ndarray:
-        light = mean_irradiance(tracer, centred(tracer, lightings[index]), places, seeds.stream(0, "direct", index, *address))
+        light = texel_irradiance(tracer, atlas, lightings[index], places, seeds.stream(0, "direct", index, *address))
         return operator.averaged(light)
 
     sent = np.concatenate(list(tracer.map(direct, range(len(lightings)))), 1)

@@ -27,7 +27,7 @@ from ddprt.progress import Progress
 from ddprt.sampling.points import Samples, load_samples, place_samples
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
-from ddprt.transport.direct import centred, mean_irradiance, on_texels
+from ddprt.transport.direct import on_texels, texel_irradiance
 from ddprt.transport.effects import Plan, plan
 from ddprt.transport.embree import Tracer
 from ddprt.transport.measure import measure
@@ -238,8 +238,7 @@ class _Bake:
         places = on_texels(self.tracer, atlas, self.config.transport.direct_samples, seeds.stream(seed, "texel positions"))
 
         def work(index: int) -> int:
-            lights = centred(self.tracer, dataset.lightings[index])
-            light = mean_irradiance(self.tracer, lights, places, seeds.stream(seed, "direct", index))
+            light = texel_irradiance(self.tracer, atlas, dataset.lightings[index], places, seeds.stream(seed, "direct", index))
             store.write_map(self.folder / map_name("direct", index), atlas.image(light))
             measured = measure(
                 self.tracer,

@@ -16,7 +16,7 @@ from ddprt.dataset.store import Dataset, Manifest, map_name, read_map, write_map
 from ddprt.progress import Progress, Stage
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
-from ddprt.transport.direct import centred, mean_irradiance, on_texels
+from ddprt.transport.direct import on_texels, texel_irradiance
 from ddprt.transport.effects import Plan
 from ddprt.transport.embree import Tracer
 
@@ -151,8 +151,8 @@ class IndirectBake:
         def work(index: int) -> np.ndarray:
             if places is None:
                 return operator.averaged(read_map(self.dataset.folder / map_name("direct", index))[covered])
-            lights = centred(self.tracer, self.dataset.lightings[index])
-            return operator.averaged(mean_irradiance(self.tracer, lights, places, seeds.stream(seed, "direct", index, half)))
+            rng = seeds.stream(seed, "direct", index, half)
+            return operator.averaged(texel_irradiance(self.tracer, self.atlas, self.dataset.lightings[index], places, rng))
 
         return np.concatenate(list(self.tracer.map(work, indices)), 1)
 

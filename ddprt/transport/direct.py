@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from ddprt.axes import Float32
+from ddprt.axes import Float32, Int
 from ddprt.compiled import compiled
 from ddprt.lights import Light, Lighting
 from ddprt.scene.atlas import Atlas
@@ -18,6 +18,9 @@ from ddprt.transport.embree import Tracer, lifted
 
 BLOCK = 1 << 14
 """Points that are shaded together: some 80 bytes each, so about a megabyte."""
+
+MOST_PLACES = 1024
+"""Shadow rays of a texel that a lamp all but touches."""
 
 Numbers = Callable[[int, Float32[np.ndarray, "2 points"]], None]
 """Writes the uniform numbers of the points from a given one on, so that lights without size draw none."""
@@ -52,12 +55,15 @@ class Places:
         return cls(np.ascontiguousarray(rows.reshape(blocks, size, 6).swapaxes(1, 2)), samples, count)
 
 
-def on_texels(tracer: Tracer, atlas: Atlas, samples: int, rng: np.random.Generator) -> Places:
-    """So many places spread over every texel, uniform by area."""
-    shift = rng.random((atlas.count, 1, 2), np.float32)
+def on_texels(
+    tracer: Tracer, atlas: Atlas, samples: int, rng: np.random.Generator, texels: Int[np.ndarray, " texels"] | None = None
+) -> Places:
+    """So many places spread over every texel, or over some, uniform by area."""
+    texels = np.arange(atlas.count) if texels is None else texels
+    shift = rng.random((len(texels), 1, 2), np.float32)
     u = (shift + _sequence(samples).T).reshape(-1, 2)
     u -= u >= 1
-    position, triangle = atlas.sampler.sample(np.repeat(np.arange(atlas.count), samples), u)
+    position, triangle = atlas.sampler.sample(np.repeat(texels, samples), u)
     return Places.of(tracer, position, tracer.normals[triangle], samples)
 
 
@@ -82,6 +88,36 @@ def mean_irradiance(
     for light in lighting:
         words = rng.integers(0, 1 << 64, 0 if light.delta else places.count, np.uint64).view(np.uint32).reshape(-1, 2)
         _add(tracer, light, places, partial(_shifted, words, _sequence(places.samples)), total, shadows)
+    return total
+
+
+def texel_irradiance(
+    tracer: Tracer, atlas: Atlas, lighting: Lighting, places: Places, rng: np.random.Generator
+) -> Float32[np.ndarray, "texels 3"]:
+    """Mean E of each texel, shadows included.
+
+    A lamp at distance d changes across a texel of width w by some w / d of its light, so texels nearer to one than a few of
+    their widths are looked at again with more places: so many that the error there stays what it is further off.
+
+    Args:
+      tracer: the occluders.
+      atlas: the texels.
+      lighting: world space.
+      places: on all texels, from `on_texels`.
+      rng: for lights with size, and for the further places.
+    Returns:
+      W/m², as in `mean_irradiance`.
+    """
+    lights = centred(tracer, lighting)
+    total = mean_irradiance(tracer, lights, places, rng)
+    lamps = [place for light in lighting if (place := light.anchor()) is not None]
+    if lamps:
+        distance = np.min([np.linalg.norm(atlas.position - lamp, axis=1) for lamp in lamps], 0)
+        ratio = distance / np.sqrt(atlas.area)
+        for low, high, factor in ((0, 1, 256), (1, 4, 16)):
+            texels, samples = np.flatnonzero((ratio >= low) & (ratio < high)), min(factor * places.samples, MOST_PLACES)
+            if len(texels) and samples > places.samples:
+                total[texels] = mean_irradiance(tracer, lights, on_texels(tracer, atlas, samples, rng, texels), rng)
     return total
 
 
