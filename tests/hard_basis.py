@@ -34,9 +34,9 @@ def _subspaces() -> Outcome:
     rows = ((left * sigma) @ right.T).astype(np.float32)
     exact = np.linalg.svd(rows.astype(float), full_matrices=False)
     moved, worst, status = oracles.bound_gram(rows.astype(float)), 0.0, "ok"
+    vectors = np.asarray(fit_basis(jnp.asarray(rows), jnp.ones(TEXELS), bases=10).vectors, float)
     for kept in (2, 4, 6, 8, 10):
-        basis = fit_basis(jnp.asarray(rows), jnp.ones(TEXELS), bases=kept)
-        U, V, S = np.asarray(basis.vectors, float), exact[2][:kept], exact[1]
+        U, V, S = vectors[:kept], exact[2][:kept], exact[1]
         turned = np.linalg.norm(U - U @ V.T @ V, 2)
         tangent = moved / (S[kept - 1] ** 2 - S[kept] ** 2 - moved)
         worst = max(worst, over_bound(turned, S[kept] / S[kept - 1] * tangent + U32 * np.sqrt(kept)))
