@@ -1,11 +1,13 @@
 """The catalogue of hard cases: what makes relighting numerically difficult, and what right means in each.
 
-`tests/test_hard_cases.py` runs it, `experiments/stability.py` makes a table of it. Cases of arrays alone stand in
-`hard_algebra.py`, those with scenes and lights that bake in `hard_scenes.py`.
+`tests/test_hard_cases.py` runs it, `experiments/stability.py` makes a table of it. Cases stand in one file per
+subject, `FILES`: those of arrays alone build on `hard_arrays.py`, `hard_flaws.py` and `hard_judges.py`, those that bake on
+`hard_bakes.py`.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -48,16 +50,33 @@ class HardCase:
     slow: bool = False
 
 
+REFUSED = frozenset({"refused"})
+"""Statuses of a case whose only right outcome is a `UserError`."""
+
+FILES = (
+    "hard_degenerate",
+    "hard_magnitudes",
+    "hard_basis",
+    "hard_transfer",
+    "hard_stores",
+    "hard_imports",
+    "hard_learners",
+    "hard_bounces",
+    "hard_lights",
+    "hard_extents",
+    "hard_walls",
+    "hard_points",
+)
+"""Where cases stand, each with its own `CASES`: first those of arrays, then those that bake."""
+
+
 def passed(case: HardCase, outcome: Outcome) -> bool:
     """Finite output within its bound, under a status that the case allows."""
     return outcome.finite and outcome.error_over_bound <= 1 and outcome.status in case.statuses
 
 
 def __getattr__(name: str) -> "tuple[HardCase, ...]":
-    # Both files of cases import the types above, so that they can only be imported once these are there.
+    # Files of cases import the types above, so that they can only be imported once these are there.
     if name != "CASES":
         raise AttributeError(name)
-    import hard_algebra
-    import hard_scenes
-
-    return hard_algebra.CASES + hard_scenes.CASES
+    return tuple(case for file in FILES for case in import_module(file).CASES)

@@ -1,8 +1,8 @@
 """The catalogue of hard cases: finite, within the bound, under a status that fits."""
 
 import pytest
-from hard_algebra import over_bound
 from hard_cases import CASES, HardCase, Outcome, passed
+from oracles import over_bound
 
 from ddprt.methods.statuses import STATUSES
 

@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hard_arrays import Arrays, make_data, room
+from oracles import U32
 
 import ddprt
 from ddprt.dataset.store import Dataset
@@ -60,6 +62,37 @@ def values(data: Dataset) -> np.ndarray:
     return data.values(data.split("test"), 24, "radiosity")
 
 
+def told(data: Dataset, measured: np.ndarray, indirect: np.ndarray) -> Dataset:
+    """The same scene with other light."""
+    other = Arrays(data.folder, data.description, None, measured, indirect)
+    known = {name: getattr(data, name) for name in ("gbuffer", "covered", "samples", "occluders", "uv")}
+    other.__dict__.update(known)
+    return other
+
+
+@pytest.fixture(scope="module")
+def light(data: Dataset) -> tuple[np.ndarray, np.ndarray]:
+    """Measured and indirect light of all lightings."""
+    every = range(len(data.lightings))
+    return data.values(every, 24, "radiosity"), data.maps("indirect", every)
+
+
+def fitted(method: str, variant: str, data: Dataset, **options: object) -> Model:
+    return ddprt.fit(data, method, bases=6, settings=SETTINGS.get(method), **VARIANTS[variant], **options)
+
+
+def assert_lawful(model: Model, values: np.ndarray) -> None:
+    """Finite, black for black, and homogeneous; a power of two changes no digit, so that twice the light is exactly twice."""
+    light = model.predict(values)
+    assert np.isfinite(light).all()
+    np.testing.assert_array_equal(model.predict(2 * values), 2 * light)
+    assert (model.predict(0 * values) == 0).all()
+    for factor in (1e-20, 1e20):  # as in test_scaling_the_light_scales_the_result, which has the tolerance
+        scaled = model.predict(values * np.float32(factor)) / np.float32(factor)
+        np.testing.assert_allclose(scaled, light, atol=300 * EPS32 * light.max(), rtol=0)
+    assert model.relighter.report.status in STATUSES
+
+
 def test_batch_equals_loop(model: Model, values: np.ndarray) -> None:
     together = model.predict(values)
     apart = np.stack([model.predict(frame) for frame in values])
@@ -100,6 +133,77 @@ def test_scaling_the_light_scales_the_result(model: Model, values: np.ndarray, f
     scaled = model.predict(values * np.float32(factor))
     # Norms and quotients are rounded anew; gamma multiplies a relative error by 2.2, sums have at most 72 terms.
     np.testing.assert_allclose(scaled / np.float32(factor), base, atol=300 * EPS32 * base.max(), rtol=0)
+
+
+@pytest.mark.parametrize("power", [-67, 67], ids=["below 1e-20", "above 1e20"])
+def test_training_light_has_no_unit(
+    model: Model,
+    power: int,
+    data: Dataset,
+    light: tuple[np.ndarray, np.ndarray],
+    values: np.ndarray,
+    request: pytest.FixtureRequest,
+) -> None:
+    """Trained at 2^-67 or 2^67 of the light, a model is the same one, to the last bit.
+
+    2^-67 = 6.8e-21, 2^67 = 1.5e20: squares of neither fit into float32. A power of two changes no digit, so that no tolerance
+    is due, whatever training would make of a rounding.
+    """
+    other = fitted(*request.node.callspec.params["model"], told(data, *(np.ldexp(part, power) for part in light)))
+    expected = model.predict(values)
+    assert expected.any()
+    np.testing.assert_array_equal(other.predict(values), expected)
+    np.testing.assert_array_equal(other.predict(np.ldexp(values, power)), np.ldexp(expected, power))
+    assert other.relighter.report.remarks == model.relighter.report.remarks
+
+
+DISTINCT = 5
+"""Points that are left when all from the fifth on measure the same light: fewer than the six bases asked for."""
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("method", METHODS)
+def test_duplicated_points_are_lawful(
+    method: str, variant: str, data: Dataset, light: tuple[np.ndarray, np.ndarray], values: np.ndarray
+) -> None:
+    """Twenty points of one light, and no ridge: nothing but the rank cut stands between rounding and the result."""
+    measured = light[0].copy()
+    measured[:, DISTINCT:] = measured[:, DISTINCT - 1 : DISTINCT]
+    twins = told(data, measured, light[1])
+    model = fitted(method, variant, twins, ridge=0.0)
+    asked = measured[twins.split("test")]
+    assert_lawful(model, asked)
+    report = model.relighter.report
+    directions = DISTINCT * (3 if model.encoding.channels == "multi" else 1)
+    assert all(rank <= directions for rank in report.ranks)
+    # Weights that rounding has driven apart cancel over twins to fewer digits than float32 has.
+    mean = fitted("mean", variant, twins)
+    truth, weight = light[1][twins.split("validation")], data.area / data.area.sum()
+    ours, floor = (
+        np.einsum("ltc,t->", (m.predict(measured[twins.split("validation")]) - truth) ** 2, weight) for m in (model, mean)
+    )
+    assert ours <= floor * (1 + 1e-5) or report.status != "ok"
+
+
+@pytest.mark.parametrize("variant", ["plain", "mean gamma multi"])
+@pytest.mark.parametrize("method", METHODS)
+def test_a_single_training_lighting_is_lawful(method: str, variant: str) -> None:
+    """Who has bases to fill says that one lighting does not; who says nothing gives that lighting back.
+
+    The room is that of the catalogue's case "one lighting", so that nothing compiles twice.
+    """
+    measured, indirect = room(train=1)
+    model = fitted(method, variant, make_data(measured, indirect))
+    assert_lawful(model, measured[1:])
+    status = model.relighter.report.status
+    if "bases" in METHODS[method].model_fields:
+        assert status != "ok"
+    if status == "ok":
+        # Two norms of n <= 30 squares are each off by (n / 2 + 2) u32, the quotient, the weight and the product by 5 more. A
+        # power p is off by (2 p |log x| + 4) u32, and what goes in by p times as much comes out: with x above e^-5 the root is
+        # off by 2 * 5 + 4 * 2.2 when it is raised again, and raising adds 2 * 5 + 4. Together below 80.
+        assert indirect[0].min() > np.exp(-5.0) * np.linalg.norm(measured[0].ravel())
+        np.testing.assert_allclose(model.predict(measured[:1]), indirect[:1], rtol=80 * U32, atol=0)
 
 
 def test_better_than_the_mean_or_says_so(model: Model, data: Dataset) -> None:

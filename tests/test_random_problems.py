@@ -1,7 +1,7 @@
 """A search for counterexamples: random problems of every size, rank and scale, against the laws of relighting.
 
 Each law takes a drawn problem and asserts. The search is the same in every run (`derandomize`); what it ever finds becomes a
-named case of the catalogue (`hard_algebra.py`). Sizes come from short lists, since every new shape is compiled.
+named case of the catalogue (`hard_cases.py`). Sizes come from short lists, since every new shape is compiled.
 """
 
 import tempfile
@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
-import hard_algebra
+import hard_arrays
 import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
-from hard_algebra import bound_left_out, judge, judge_basis, judge_fit, right_transfer
+from hard_judges import bound_left_out, judge, judge_basis, judge_fit, right_transfer
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from oracles import TINY32, over_bound
@@ -264,7 +264,7 @@ _CHAINS = st.builds(
 def relighting_is_right(problem: Chain) -> None:
     """From light to light: every layer within its bound, and the laws of `Model`."""
     rng = np.random.default_rng(problem.seed)
-    measured, indirect = hard_algebra.room(problem.rank, seed=problem.seed % 2**31)
+    measured, indirect = hard_arrays.room(problem.rank, seed=problem.seed % 2**31)
     size = np.float32(10.0**problem.decade)
     for part in (measured, indirect):
         if "twin columns" in problem.flaws:
@@ -278,9 +278,9 @@ def relighting_is_right(problem: Chain) -> None:
         if "decades" in problem.flaws:
             part *= np.logspace(-6, 6, part.shape[1]).astype(np.float32)[:, None]
         part *= size
-    data = hard_algebra.make_data(measured, indirect)
-    model = ddprt.fit(data, bases=hard_algebra.BASES, **problem.options)
-    probes = measured[-hard_algebra.TEST :]
+    data = hard_arrays.make_data(measured, indirect)
+    model = ddprt.fit(data, bases=hard_arrays.BASES, **problem.options)
+    probes = measured[-hard_arrays.TEST :]
     out = model.predict(probes)
     assert np.isfinite(out).all()
     assert judge(data, model, probes) <= 1
