@@ -12,6 +12,7 @@ from hard_judges import bound_left_out, judge_fit
 from oracles import U64, over_bound, rounding
 
 from ddprt.errors import UserError
+from ddprt.fitting.selection import decompose, left_out
 from ddprt.fitting.transfer import fit_transfer
 
 
@@ -112,14 +113,17 @@ def _path_ends() -> Outcome:
     X, C = (part.astype(np.float32) for part in problem(24, 10))
     fit = fit_transfer(jnp.asarray(X), jnp.asarray(C))
     path = np.asarray(fit.path)
-    zero = fit_transfer(jnp.asarray(X), jnp.asarray(C), ridge=0.0).leave_one_out
-    nothing = float(np.sqrt(np.mean(np.sum(C.astype(float) ** 2, 1))))
+    zero, best = (
+        float(np.mean(np.sqrt(left_out(decompose(jnp.asarray(X), jnp.asarray(C)), np.array([r]))[0][0])))
+        for r in (0.0, fit.ridge)
+    )
+    nothing = float(np.mean(np.sqrt(np.sum(C.astype(float) ** 2, 1))))
     # At the far end the map shrinks by sigma² / (sigma² + ridge) at most: so near is its residual to that of no map.
     share = float(np.asarray(fit.singular_values)[0] ** 2 / path[-1, 0])
     worst = max(
         over_bound(path[0, 1] - zero, rounding(sum(X.shape), U64) * zero),
         over_bound(path[-1, 1] - nothing, 2 * share * nothing),
-        over_bound(max(fit.leave_one_out - path[:, 1].min(), 0.0), rounding(sum(X.shape), U64) * path[:, 1].min()),
+        over_bound(best - path[:, 1].min(), rounding(sum(X.shape), U64) * path[:, 1].min()),
     )
     return Outcome(worst, fit.status, bool(np.isfinite(path).all()))
 

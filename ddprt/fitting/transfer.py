@@ -36,7 +36,7 @@ class Transfer:
       condition: largest singular value over the smallest one that counts towards the rank; 0 without signal.
       rank: numerical rank of the measurements.
       leave_one_out: root of the weighted mean squared leave-one-out residual of a row's coefficients.
-      path: leave-one-out residual at every ridge tried, as (ridge, residual) rows; empty unless it was chosen here.
+      path: the leave-one-out error that decided, at every ridge tried, as (ridge, error) rows; empty unless it was chosen here.
       remarks: all of these that hold, the worst first. "no_signal": nothing was measured; "overfitted": a lighting that is
         left out is predicted no better than by black (by the mean, with an intercept); "ill_conditioned": directions that
         nearly carry nothing decide, and no ridge holds them back; "overdamped": the ridge takes more than half even of the
@@ -77,8 +77,7 @@ def fit_transfer(
       measured: X, scaled and encoded direct light at the points, dimensionless; rows of zeros train nothing.
       coefficients: C, those of the scaled and encoded indirect light.
       ridge: weight in units of measured², >= 0; 0 gives the pseudo-inverse; one value per point weighs them apart;
-        "auto" minimises this matrix' own mean squared leave-one-out residual (methods choose for all channels at once, see
-        `choose_ridge`).
+        "auto" is `choose_ridge` of this matrix alone (methods choose for all channels at once).
       importance: weight of each row's leave-one-out residual, s² to agree with errors in W/m²; 1 where it is left out, or
         where all of it is zero.
       intercept: fit one, by centring both sides.
@@ -93,7 +92,7 @@ def fit_transfer(
     spectrum = decompose(measured, coefficients, stretch=stretch, intercept=intercept)
     if ridge != "auto":
         return solve_transfer(spectrum, ridge, stretch, weight)
-    choice = choose_ridge([spectrum], [weight], [np.arange(len(weight))], power=2.0)
+    choice = choose_ridge([spectrum], [weight], [np.arange(len(weight))])
     return solve_transfer(spectrum, choice.ridge, None, weight, path=choice.path[:, :2])
 
 
