@@ -133,8 +133,6 @@ class Run:
             stage.facts |= {key: evaluation.spot_check[key] for key in ("rays",) if key in evaluation.spot_check}
         summary = {key: value for key, value in evaluation.spot_check.items() if key not in ("baked", "truth", "variance")}
         evaluation.metrics["spot_check"] = summary
-        for name, model in models.items():
-            evaluation.metrics["methods"][name]["remarks"] = list(model.relighter.report.remarks)
         report = next(iter(models.values())).relighter.report
         evaluation.metrics["numerics"] |= {
             "measurement_rank": list(report.ranks),

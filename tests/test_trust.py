@@ -234,7 +234,8 @@ def test_dark_frames_and_channels(model: Model, values: np.ndarray) -> None:
         # The green channel carries no energy, so what was strange in it does not count.
         other = dark[1].copy()
         other[:, [0, 2]] = values[1][:, [0, 2]]
-        np.testing.assert_array_equal(found.score[1], model.trust(other).score)
+        # A frame alone is summed in another order than in a batch: a few roundings.
+        np.testing.assert_allclose(found.score[1], model.trust(other).score, rtol=8 * np.finfo(np.float32).eps)
 
 
 @pytest.mark.parametrize(("place", "value"), [((0, 0), np.nan), ((2, 1), np.inf)])

@@ -140,8 +140,8 @@ def average_into_points(
     weighted = irradiance * samples.albedo.astype(np.float32) if quantity == "radiosity" else irradiance
     # Sums in the order of the samples: a product of matrices would depend on the number of threads.
     start = np.searchsorted(np.sort(home), np.arange(points))
-    sums = np.add.reduceat(weighted[:, np.argsort(home, kind="stable")], start, axis=1)
-    return sums / np.bincount(home)[:, None].astype(np.float32)
+    share = (1 / np.bincount(home)).astype(np.float32)  # taken before the sum, which might be too much for float32
+    return np.add.reduceat((weighted * share[home, None])[:, np.argsort(home, kind="stable")], start, axis=1)
 
 
 def open_dataset(folder: str | Path) -> Dataset:

@@ -1,7 +1,8 @@
 """The choice of a ridge: leave one lighting out, in closed form, for every ridge of a path after a single decomposition.
 
 Three things can fool a plain leave-one-out, and each is met here. A lighting with a twin (the same lamp at another
-brightness has the same scaled measurements) is predicted by its twin: twins are left out together. A few lightings with
+brightness has the same scaled measurements) is predicted by its twin: twins are left out together, and so are lightings that
+nearly repeat each other (a lamp measured twice, frames of a slow path). A few lightings with
 great errors decide a mean of squares: the mean of norms is minimised instead. And 1 - h, by which a residual is divided,
 cancels where a lighting decides its own fit: it is summed from its positive parts.
 """
@@ -19,8 +20,11 @@ RANK_CUT = 1e-7
 """Singular values below this share of the largest are rounding of the float32 measurements."""
 TWINS = 8 * float(np.finfo(np.float32).eps)
 """Rows nearer than this share of their size are one lighting: scaling rounds each value three times, in each of two rows."""
+REPEATS = 0.01
+"""Rows nearer than this share of their size are left out with a row: lamps drawn in a room lie ten times further apart."""
 SECOND_OPINION = 1.1
 """How far the leave-one-out error at the ridge of generalised cross-validation may lie above its own minimum: a tenth."""
+_EPS = float(np.finfo(np.float64).eps)
 _RIDGES = 57  # four per decade, from 1e-13 to 10 times the largest squared singular value; below it the rank cut decides
 
 
@@ -36,6 +40,7 @@ class Spectrum:
       targets: C of every row, centred.
       group: which row of `left` each row of the data went to; twins share one.
       count: how many twins each row of `left` stands for.
+      repeats: a row of `left` that others nearly repeat, and those others; one entry per such row.
       offset, start: means taken off both sides, zero without intercept.
       rank: how many directions carry signal; the others are rounding and get no weight under any ridge, since a tiny one
         would blow them up.
@@ -48,6 +53,7 @@ class Spectrum:
     targets: Float[Array, "lightings bases"]
     group: Int[np.ndarray, " lightings"]
     count: Float[np.ndarray, " groups"]
+    repeats: tuple[Int[np.ndarray, " _"], ...]
     offset: Float[Array, " points"]
     start: Float[Array, " bases"]
     rank: int
@@ -96,27 +102,32 @@ def decompose(
       intercept: centre both sides.
     """
     X = np.asarray(measured, np.float64)
-    group, count = _twins(X)
+    _, first, group, count = np.unique(
+        np.argmax(_near(X, TWINS), 1), return_index=True, return_inverse=True, return_counts=True
+    )
+    near = _near(X[first], REPEATS)
+    np.fill_diagonal(near, False)
+    repeats = tuple(np.append(row, np.flatnonzero(near[row])) for row in np.flatnonzero(near.any(1)))
     with jax.enable_x64(True):
         parts = _decompose(
             jnp.asarray(X),
             jnp.asarray(np.asarray(coefficients, np.float64)),
             jnp.ones(X.shape[1]) if stretch is None else jnp.asarray(stretch),
             jnp.asarray(group),
-            jnp.asarray(count),
+            jnp.asarray(count.astype(np.float64)),
             intercept,
             stretch is not None,
         )
         plain = np.asarray(parts[-1])
     rank = int(np.sum(plain > RANK_CUT * plain.max(initial=0)))
     left, values, right, turned, targets, offset, start, _ = parts
-    return Spectrum(left, values, right, turned, targets, group, count, offset, start, rank)
+    return Spectrum(left, values, right, turned, targets, group, count.astype(np.float64), repeats, offset, start, rank)
 
 
 def left_out(
     spectrum: Spectrum, ridges: Float[np.ndarray, " ridges"]
 ) -> tuple[Float[np.ndarray, "ridges lightings"], Float[np.ndarray, "ridges lightings"]]:
-    """Squared norm of each lighting's error when it (with its twins) is left out, and what its mean leverage would make it.
+    """Squared norm of each lighting's error when it is left out with its like, and what its mean leverage would make it.
 
     The second is for generalised cross-validation, which puts the mean of 1 - h in the place of each (Golub, Heath and
     Wahba 1979).
@@ -126,7 +137,7 @@ def left_out(
     held = np.arange(len(S)) < spectrum.rank
     # A row that is orthogonal to all directions without signal, up to rounding, decides its own fit as the ridge goes to 0.
     # There both sides of the quotient vanish with the ridge; without that factor they have a limit.
-    alone = np.sum(Q[:, ~held] ** 2, 1) <= (len(count) * np.finfo(np.float64).eps) ** 2
+    alone = np.sum(Q[:, ~held] ** 2, 1) <= (len(count) * _EPS) ** 2
     mean = np.zeros((len(count), C.shape[1]))
     np.add.at(mean, group, C / count[group, None])
     inward, weight, squares = C - mean[group], 1 / np.sqrt(count[group, None]), Q**2
@@ -138,14 +149,21 @@ def left_out(
     for index, ridge in enumerate(ridges):
         # e_k = ((Id - H) c)_k / (1 - h_kk), where Id - H = Q diag(t) Q^T with t = ridge / (S² + ridge), 1 past the rank.
         sizes = _positive(S**2 + ridge)
-        error, free = typical = parts(np.where(held, ridge / sizes, 1))
+        least = np.min(sizes, where=held, initial=np.inf)
+        loose, tight = np.where(held, ridge / sizes, 1), np.where(held, least / sizes, 0)
+        error, free = typical = parts(loose)
         if alone.any():
-            near, bound = limit = parts(np.where(held, np.min(sizes, where=held, initial=np.inf) / sizes, 0))
+            near, bound = limit = parts(tight)
             error, free = np.where(alone[:, None], near, error), np.where(alone, bound, free)
             typical = limit if held.all() else typical
-        general = typical[0] / (np.mean(typical[1]) or 1)
+        error, general = error / _positive(free)[:, None], typical[0] / (np.mean(typical[1]) or 1)
+        for rows in spectrum.repeats:
+            # e = ((Id - H)_rows)^-1 ((Id - H) c)_rows is a least-squares solution, which does not square their likeness.
+            share = tight if alone[rows].all() else np.maximum(loose, np.where(held, _EPS * least / sizes, 1))
+            root = np.sqrt(share)[:, None]
+            error[rows[0]] = np.linalg.lstsq(root * Q[rows].T, root * QtC, rcond=None)[0][0]
         # Twins share a prediction: their mean target less the error of their row.
-        for found, row in ((each, error / _positive(free)[:, None]), (generalised, general)):
+        for found, row in ((each, error), (generalised, general)):
             found[index] = np.sum((inward + row[group] * weight) ** 2, 1)
     return each, generalised
 
@@ -211,18 +229,16 @@ def _mean(squares: np.ndarray, weight: np.ndarray, power: float) -> np.ndarray:
     if power > 0:
         return (np.sum(squares ** (power / 2), -1) / np.sum(weight ** (power / 2))) ** (1 / power)
     lit = weight > 0
-    least = np.finfo(np.float64).eps ** 2  # of its weight: a residual below it is rounding
+    least = _EPS**2  # of its weight: a residual below it is rounding
     return np.exp(np.mean(np.log(np.maximum(squares[..., lit] / weight[lit], least)), -1) / 2)
 
 
-def _twins(X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The group of each row, and the size of each group."""
+def _near(X: np.ndarray, share: float) -> np.ndarray:
+    """Whether two rows are within a share of their size of each other."""
     size = np.einsum("lp,lp->l", X, X)
     pair = size[:, None] + size
     # Gram entries are good to about points * eps64 of their size, far below the square of TWINS.
-    first = np.argmax(pair - 2 * X @ X.T <= TWINS**2 / 2 * pair, 1)
-    _, group, count = np.unique(first, return_inverse=True, return_counts=True)
-    return group, count.astype(np.float64)
+    return pair - 2 * X @ X.T <= share**2 / 2 * pair
 
 
 @partial(jax.jit, static_argnums=(5, 6))

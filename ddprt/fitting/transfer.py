@@ -18,6 +18,7 @@ from ddprt.fitting.selection import Spectrum, choose_ridge, decompose, left_out
 
 ILL_CONDITIONED = 1e6
 """Condition number past which coefficients of float32 measurements are not to be trusted without a ridge."""
+_WIDEST = 1e100  # of the ridge of a point, so that squares of what it stretches keep in range
 _ENDLESS = 1e30  # times the largest squared singular value: a ridge that leaves nothing of M
 
 Status = Literal["ok", "rank_deficient", "ill_conditioned", "no_signal", "overdamped", "overfitted"]
@@ -82,7 +83,7 @@ def fit_transfer(
         where all of it is zero.
       intercept: fit one, by centring both sides.
     Raises:
-      UserError: ridges that are negative or not finite, or not as many as points; a mix of zero and positive ones.
+      UserError: ridges that are negative or not finite, or not as many as points; one for a point outside of 1e-100 to 1e100.
       ValueError: the two sides have different numbers of lightings.
     """
     if len(measured) != len(coefficients):
@@ -149,9 +150,12 @@ def point_stretch(ridge: float | int | tuple[float, ...] | str, points: int) -> 
         return None
     if len(ridge) != points:
         raise UserError(f"fit.ridge: got {len(ridge)} values, expected one per measurement ({points}), a number or auto")
-    wrong = [value for value in ridge if not 0 < value < np.inf]
+    wrong = [value for value in ridge if not 1 / _WIDEST <= value <= _WIDEST]
     if wrong:
-        raise UserError(f"fit.ridge: got {wrong[0]:g} for a point, expected all above 0; use 0 alone for the pseudo-inverse")
+        raise UserError(
+            f"fit.ridge: got {wrong[0]:g} for a point, expected {1 / _WIDEST:g} to {_WIDEST:g}; "
+            "use 0 alone for the pseudo-inverse"
+        )
     return 1 / np.sqrt(np.array(ridge, np.float64))
 
 

@@ -15,6 +15,7 @@ from ddprt.config import Config
 from ddprt.dataset.store import Dataset
 from ddprt.fitting.basis import entry_weights
 from ddprt.fitting.encoding import Encoding
+from ddprt.methods.statuses import BLIND
 from ddprt.report.metrics import Truth, negative_share, negative_shares, z_scores
 from ddprt.runtime.model import Model
 from ddprt.runtime.train import fit_method
@@ -58,12 +59,15 @@ def evaluate(data: Dataset, models: Mapping[str, Model], fit_seconds: Mapping[st
     """
     test = data.split("test")
     truth = Truth(data.maps("indirect", test), data.area)
+    whole = float(truth.squares.sum())
     predicted, scores, values = {}, {}, np.zeros((0, 0, 3))
     for name, model in models.items():
         values = data.values(test, model.points, model.quantity)
         unclamped, relight_seconds = _frame_by_frame(model, values)
         predicted[name] = np.maximum(unclamped, 0)  # the clamp commutes with decoding, which is odd and rising
-        report, shares = model.relighter.report, negative_shares(unclamped, truth.weight)
+        unseen = float(truth.squares[~values.any((1, 2))].sum())
+        report = model.relighter.report.noting(*(["blind"] if unseen > BLIND * whole else []))
+        shares = negative_shares(unclamped, truth.weight)
         scores[name] = {
             **truth.scores(predicted[name]),
             "negative_share": _finite(negative_share(unclamped, truth.weight)),
@@ -75,6 +79,7 @@ def evaluate(data: Dataset, models: Mapping[str, Model], fit_seconds: Mapping[st
             "flops": model.relighter.flops,
             "bases": report.bases,
             "status": report.status,
+            "remarks": list(report.remarks),
         }
     lead, main = next(iter(models.items()))
     report = main.relighter.report

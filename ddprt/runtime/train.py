@@ -20,8 +20,15 @@ from ddprt.lights import Lighting
 from ddprt.methods import make_method
 from ddprt.methods.floors import MeanLightmap
 from ddprt.methods.method import Examples, Frame, Relighter, unseen_share
+from ddprt.methods.statuses import BLIND
 from ddprt.runtime.model import Model
 from ddprt.runtime.trust import Yardstick, calibrated, make_yardstick, outside
+
+ROUNDING = 1e-6
+"""Relative error that float32 makes by itself: an eps for each of some 16 bases, with random signs and room for more."""
+
+USELESS = 0.99
+"""Share of the error of black from which a method counts as no better than it."""
 
 
 def fit(
@@ -104,32 +111,31 @@ def fit_method(
 
 
 def _judged(relighter: Relighter, encoding: Encoding, train: Examples, validation: Examples) -> tuple[Relighter, Yardstick]:
-    """The laws that a method beats the mean lightmap on its validation set and was trained on its kind, or says that not."""
+    """The laws that a method beats mean lightmap and black on its validation set and was trained on its kind, or says not."""
     mean = MeanLightmap().fit(train, validation, key=jax.random.key(0))
     frame = validation.frame
     area = jnp.asarray(validation.area / validation.area.sum(), jnp.float32)
     data = frame.values, frame.positions, frame.normals, validation.indirect, validation.scale, area
     lightings = None if frame.lightings is None else tuple(frame.lightings)
-    ours, floor, whole = (
-        np.asarray(part, np.float64)
-        for part in (*(_squares(one, encoding, *data, lightings) for one in (relighter, mean)), _energy(encoding, *data[3:]))
-    )
+    ours, floor, whole = (np.asarray(_squares(one, encoding, *data, lightings), np.float64) for one in (relighter, mean, None))
     yardstick = make_yardstick(train, encoding)
     novelty = yardstick.novelty(frame.values, validation.scale)
     lit = whole > 0
     of_ours, of_mean = (np.sqrt(np.divide(part, whole, out=np.full_like(whole, np.nan), where=lit)) for part in (ours, floor))
     yardstick = calibrated(yardstick, novelty, of_ours, of_mean)
     report = relighter.report
-    if not ours.sum() <= floor.sum():
+    if not ours.sum() <= min(floor.sum() + ROUNDING**2 * whole.sum(), USELESS**2 * whole.sum()):
         report = report.noting("worse_than_mean")
     if outside(yardstick, novelty[np.asarray(validation.scale).max(1) > 0]):
         report = report.noting("extrapolating")
+    if validation.unseen > BLIND:
+        report = report.noting("blind")
     return replace(relighter, report=report), yardstick  # type: ignore[type-var]
 
 
 @partial(jax.jit, static_argnames="lightings")
 def _squares(
-    relighter: Relighter,
+    relighter: Relighter | None,
     encoding: Encoding,
     values: Array,
     positions: Array,
@@ -139,21 +145,14 @@ def _squares(
     area: Array,
     lightings: tuple[Lighting, ...] | None,
 ) -> Array:
-    """Area-weighted squared error of each lighting, relative to the brightest one so that no square overflows."""
-    light = relighter.predict(Frame(values, positions, normals, lightings))
-    relative = _relative(scale)
-    difference = encoding.decode(light, relative) - encoding.decode(indirect, relative)
-    return jnp.einsum("ltc,t->l", difference**2, area)
-
-
-@jax.jit
-def _energy(encoding: Encoding, indirect: Array, scale: Array, area: Array) -> Array:
-    """Area-weighted square of the light of each lighting, in the same units."""
-    return jnp.einsum("ltc,t->l", encoding.decode(indirect, _relative(scale)) ** 2, area)
-
-
-def _relative(scale: Array) -> Array:
-    return scale / jnp.maximum(jnp.max(scale), jnp.finfo(jnp.float32).tiny)
+    """Area-weighted squared error of each lighting (None answers with black), in units of the peak to keep in range."""
+    relative = scale / jnp.maximum(jnp.max(scale), jnp.finfo(jnp.float32).tiny)
+    truth = encoding.decode(indirect, relative)
+    peak = jnp.max(jnp.abs(truth), initial=0)
+    answer = (
+        0.0 if relighter is None else encoding.decode(relighter.predict(Frame(values, positions, normals, lightings)), relative)
+    )
+    return jnp.einsum("ltc,t->l", ((answer - truth) / jnp.where(peak > 0, peak, 1)) ** 2, area)
 
 
 def examples(data: Dataset, split: str, encoding: Encoding, config: FitConfig, points: int, quantity: str) -> Examples:

@@ -134,10 +134,10 @@ def calibrated(
       error: of the model there, norm over norm; NaN where the reference is dark.
       of_mean: that of the mean lightmap.
     """
-    known = np.isfinite(error) & (novelty > 0) & (novelty < 1)
+    known = ~np.isnan(error) & (novelty > 0) & (novelty < 1)
     if not known.any():
         return yardstick
-    x, y = np.log(np.maximum(novelty[known], _LEAST)), np.log(np.maximum(error[known], _LEAST))
+    x, y = (np.log(np.clip(part[known], _LEAST, 1 / _LEAST)) for part in (novelty, error))
     exponent = max(float(x @ y / (x @ x)), 0.0)
     return replace(yardstick, exponent=exponent, fade_from=min(float(np.median(of_mean[known])), 1.0))
 
@@ -152,10 +152,14 @@ def outside(yardstick: Yardstick, novelty: Float[np.ndarray, " lightings"]) -> b
 
 
 def _left_out(spectrum: Spectrum, ridge: float) -> np.ndarray:
-    """lambda x^T (D D^T + lambda Id - x x^T)^-1 x = lambda h / (1 - h) of each row, twins left out together."""
+    """lambda x^T (D D^T + lambda Id - R R^T)^-1 x of each row, R being the row and its like: lambda h / (1 - h) by itself."""
     left, squares = np.asarray(spectrum.left), np.asarray(spectrum.values) ** 2
-    bound, free = left**2 @ (squares / (squares + ridge)), left**2 @ (ridge / (squares + ridge))
-    return (ridge * bound / free / np.asarray(spectrum.count))[spectrum.group]
+    held, loose = squares / (squares + ridge), ridge / (squares + ridge)
+    odds = left**2 @ held / (left**2 @ loose)
+    for rows in spectrum.repeats:
+        bound, free = (left[rows] * share @ left[rows].T for share in (held, loose))
+        odds[rows[0]] = bound[0] @ np.linalg.pinv(free, hermitian=True)[0]
+    return (ridge * odds / np.asarray(spectrum.count))[spectrum.group]
 
 
 def _sketched(train: Examples) -> np.ndarray:
