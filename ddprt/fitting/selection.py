@@ -148,7 +148,7 @@ def left_out(
     each, generalised = np.zeros((2, len(ridges), len(C)))
     for index, ridge in enumerate(ridges):
         # e_k = ((Id - H) c)_k / (1 - h_kk), where Id - H = Q diag(t) Q^T with t = ridge / (S² + ridge), 1 past the rank.
-        sizes = _positive(S**2 + ridge)
+        sizes = _positive(np.where(held, S**2 + ridge, 1))
         least = np.min(sizes, where=held, initial=np.inf)
         loose, tight = np.where(held, ridge / sizes, 1), np.where(held, least / sizes, 0)
         error, free = typical = parts(loose)

@@ -7,7 +7,7 @@ STATUSES = {
     "diverged": "Training met numbers that are not finite; the weights of the best round before are kept, and training was not "
     "started again. Likely causes: a learning rate too high, or lightings that are bright though hardly any point sees them. "
     "What to do: lower methods.settings.mlp.learning_rate, or use more points.",
-    "worse_than_mean": "On the validation lightings this method does worse than the mean lightmap, or hardly better than black. "
+    "worse_than_mean": "On the validation lightings this method is worse than the mean lightmap, or hardly better than black. "
     "Likely causes: too few training lightings or steps, or validation lightings unlike the training ones or "
     "in other units. What to do: bake more lightings, train longer, or take another method; do not ship it.",
     "overfitted": "A training lighting that is left out is predicted no better than by black (where centred, by the mean): "
