@@ -36,7 +36,7 @@ from ddprt.transport.openness import build_open_atlas
 
 DEPTH = 0.75  # of the distance between samples: what they mistake for a constant shrinks to 1.8 %
 _NAMED = 8  # doubtful lightings, or altered files, that a message spells out
-_TOLD = 4  # settings that differ, the same
+_TOLD = 4  # settings that differ and that a message spells out
 _WIDTH = 60  # characters of a value in a message
 _SAID = {"placing": "points", "counts": "lightings"}  # what dataset.json calls otherwise than the configuration does
 
@@ -142,7 +142,7 @@ def _shown(value: Any) -> str:
     words = "nothing" if value is ... else json.dumps(value)
     if len(words) <= _WIDTH:
         return words
-    return f"{len(value)} entries" if isinstance(value, list | dict) else f"{words[: _WIDTH - 3]}..."
+    return f"a list of {len(value)}" if isinstance(value, list) else f"{words[: _WIDTH // 2]}...{words[-_WIDTH // 2 :]}"
 
 
 def check_points(config: Config, scene: Scene, atlas: Atlas) -> None:
@@ -159,12 +159,8 @@ def check_points(config: Config, scene: Scene, atlas: Atlas) -> None:
         )
 
 
-def _lightings_settings(entries: Sequence[tuple[str, Lighting]], drawn: dict[str, int]) -> dict[str, Any]:
-    """What dataset.json says of its lightings."""
-    return {
-        "drawn": drawn,
-        "lightings": [{"split": split, "lights": lighting_json(lighting)} for split, lighting in entries],
-    }
+def _records(entries: Sequence[tuple[str, Lighting]]) -> list[dict[str, Any]]:
+    return [{"split": split, "lights": lighting_json(lighting)} for split, lighting in entries]
 
 
 class _Bake:
@@ -192,8 +188,8 @@ class _Bake:
         lightings = [lighting for _, lighting in entries]
         listed = listed and self._sunk(listed, lightings)
         if there is not None:
-            self._refuse_other(there, {"counts": _counts([{"split": split} for split, _ in entries])})
-            self._refuse_other(there, _lightings_settings(entries, drawn) | (self._points_settings(listed) if listed else {}))
+            points = {"points": self._points(listed)} if listed else {}
+            self._refuse_other(there, {"counts": _counts(_records(entries)), "lightings": _records(entries), **points})
         effects = plan(self.scene, lightings, bounces=self.config.transport.bounces)
         if self.config.transport.integrator in ("paths", "reference"):  # the operator tells what it left out, if anything
             for effect in effects.effects:
@@ -244,13 +240,14 @@ class _Bake:
             **baked_settings(self.config, self.scene),
             "quantity": "irradiance",
             "unit": "W/m2",
-            **self._points_settings(samples),
+            "points": self._points(samples),
             "plan": [asdict(effect) for effect in effects.effects],
-            **_lightings_settings(entries, drawn),
+            "drawn": drawn,
+            "lightings": _records(entries),
         }
 
-    def _points_settings(self, samples: Samples) -> dict[str, Any]:
-        return {"points": {"count": self.config.points.count, "digest": samples.digest}}
+    def _points(self, samples: Samples) -> dict[str, Any]:
+        return {"count": self.config.points.count, "digest": samples.digest}
 
     def _refuse_other(self, there: dict[str, Any], wanted: dict[str, Any]) -> None:
         """Makes sure that what lies in the folder is, so far, this very bake."""
