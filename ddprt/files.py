@@ -1,6 +1,7 @@
-"""Files that are whole or absent: temporary name, fsync, rename."""
+"""Files that are whole or absent: temporary name, fsync, rename; folders that one process at a time writes to."""
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -8,6 +9,80 @@ from pathlib import Path
 import numpy as np
 
 from ddprt.errors import UserError
+
+_TEMPORARY = re.compile(r"\..+\.\d+\.tmp(\.\w+)?")  # what `written_whole` writes to
+_TRIES = 100  # at a lock that others make and remove meanwhile
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Keeps all others that ask for the same folder out of it while the block runs.
+
+    The lock is a flock on the file `.lock`: it dies with its process, however that ends, and the file goes at the end of the
+    block. Temporary files of `written_whole` that a killed process left in the folder, or in a folder in it, are removed. Who
+    only reads need not ask. Where there is no flock (Windows, some network file systems), or where nothing can be written,
+    nobody is kept out and nothing is removed.
+
+    Raises:
+      UserError: another process is there, or the folder cannot be made.
+    """
+    lock = _locked(folder)
+    try:
+        if lock is not None:
+            for path in (*folder.glob(".*.tmp*"), *folder.glob("*/.*.tmp*")):
+                if _TEMPORARY.fullmatch(path.name):
+                    with suppress(OSError):  # it only takes room
+                        path.unlink()
+        yield
+    finally:
+        if lock is not None:
+            with suppress(OSError):
+                if _is_at(folder / ".lock", lock):
+                    (folder / ".lock").unlink()
+            os.close(lock)
+            with suppress(OSError):  # nothing was written where the block was left early; any other folder is not empty
+                folder.rmdir()
+
+
+def _locked(folder: Path) -> int | None:
+    """The open and locked file `.lock`, or None where there are no locks."""
+    try:
+        import fcntl
+    except ImportError:
+        return None
+    path = folder / ".lock"
+    for _ in range(_TRIES):
+        make_folder(folder)
+        try:
+            lock = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        except FileNotFoundError:  # whoever was here before has just removed the empty folder
+            continue
+        except OSError as error:
+            if not os.access(folder, os.W_OK):
+                return None
+            raise UserError(
+                f"{path}: cannot be opened ({error.strerror or error}); delete it, or choose another folder"
+            ) from None
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(lock)
+            break
+        except OSError:
+            os.close(lock)
+            return None
+        if _is_at(path, lock):
+            return lock
+        os.close(lock)  # whoever was here before removed it between our opening and our locking
+    raise UserError(f"{folder}: another bake is working in this folder; wait for it, or give another --out")
+
+
+def _is_at(path: Path, file: int) -> bool:
+    """Whether an open file is the one that a path leads to."""
+    try:
+        return os.path.samestat(os.fstat(file), path.stat())
+    except FileNotFoundError:
+        return False
 
 
 @contextmanager

@@ -86,7 +86,7 @@ class Run:
         if differs:
             name = data.description["scene"]["name"]
             raise UserError(
-                f'{self.folder}: got a dataset of scene "{name}" baked otherwise ({", ".join(differs)} differ), expected '
+                f'{self.folder}: got a dataset of scene "{name}" baked otherwise ({differs}), expected '
                 f'"{self.scene.name}" as configured now; bake again into another --out'
             )
         return data

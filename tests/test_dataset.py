@@ -1,7 +1,9 @@
 """Baking, storing, interrupting, going on, and finding damage."""
 
+import errno
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -14,10 +16,14 @@ import pytest
 
 import ddprt
 from ddprt.config import Config
-from ddprt.dataset.generate import bake
+from ddprt.dataset import generate
+from ddprt.dataset.generate import bake, differences
+from ddprt.dataset.indirect import IndirectBake
+from ddprt.dataset.scratch import Scratch
 from ddprt.dataset.splits import split_lightings
 from ddprt.dataset.store import Manifest, average_into_points, expected_files, open_dataset, read_map, write_map
 from ddprt.errors import UserError
+from ddprt.files import alone_in
 from ddprt.progress import Progress
 from ddprt.sampling.points import Samples
 from ddprt.scene.mesh import Scene
@@ -148,6 +154,158 @@ def test_killed_and_interrupted_bakes_go_on(cornell: Scene, tmp_path: Path) -> N
     assert set(whole) == set(resumed)
 
 
+OCCUPIED = """
+import sys, time
+from pathlib import Path
+from ddprt.files import alone_in
+with alone_in(Path(sys.argv[1])):
+    print("in", flush=True)
+    time.sleep(600)
+"""
+
+
+def test_a_lock_dies_with_its_process_and_keeps_no_reader_out(
+    baked: Path, cornell: Scene, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    from ddprt.cli import main
+
+    folder = tmp_path / "run" / "dataset"
+    shutil.copytree(baked, folder)
+    job = tmp_path / "job.toml"
+    job.write_text(small().to_toml())
+    with subprocess.Popen([sys.executable, "-c", OCCUPIED, str(folder)], stdout=subprocess.PIPE, text=True) as other:
+        try:
+            assert other.stdout is not None
+            assert other.stdout.readline() == "in\n"
+            with pytest.raises(SystemExit) as refused:
+                main(["bake", str(job), "--out", str(folder.parent)])
+            assert refused.value.code == 2
+            words = f"{folder}: another bake is working in this folder; wait for it, or give another --out\n"
+            assert capsys.readouterr().err.endswith(words)
+            assert len(open_dataset(folder).maps("indirect", range(8))) == 8
+            with pytest.raises(SystemExit) as fine:
+                main(["verify", str(folder)])
+            assert fine.value.code == 0
+        finally:
+            other.kill()
+    assert (folder / ".lock").exists(), "nobody could remove it"
+    bake(cornell, config=small(), out=folder)
+    assert files(folder) == files(baked)
+
+
+def test_a_bake_is_alone_to_its_end(baked: Path, cornell: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    refused = []
+
+    def intruding(self: Scratch) -> None:
+        with pytest.raises(UserError, match="another bake is working in this folder"):
+            bake(cornell, config=small(), out=tmp_path / "dataset")
+        refused.append(self.path.name)
+        remove(self)
+
+    remove = Scratch.remove
+    monkeypatch.setattr(Scratch, "remove", intruding)
+    bake(cornell, config=small(), out=tmp_path / "dataset")
+    assert refused == ["train-0.part", "test-0.part", "test-1.part"]
+    assert files(tmp_path / "dataset") == files(baked)
+
+
+def test_a_lock_whose_file_was_just_removed_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The one before removes its file between our opening and our locking: others would lock a new one beside us."""
+    fcntl = pytest.importorskip("fcntl")
+    flock, tries = fcntl.flock, []
+
+    def late(file: int, operation: int) -> None:
+        tries.append(file)
+        if len(tries) == 1:
+            (tmp_path / "dataset" / ".lock").unlink()
+        flock(file, operation)
+
+    monkeypatch.setattr(fcntl, "flock", late)
+    with alone_in(tmp_path / "dataset"):
+        assert len(tries) == 2
+        with pytest.raises(UserError, match="another bake"), alone_in(tmp_path / "dataset"):
+            pass
+    assert list(tmp_path.iterdir()) == [], "no folder where nothing was written"
+
+
+@pytest.mark.parametrize("why", ["no flock on this platform", "none on this file system"])
+def test_where_there_is_no_lock_nothing_is_kept_out_or_removed(
+    why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = tmp_path / ".000000.exr.25623.tmp.exr"
+    left.write_text("")
+    if why == "no flock on this platform":
+        monkeypatch.setitem(sys.modules, "fcntl", None)
+    else:
+
+        def none(file: int, operation: int) -> None:
+            raise OSError(errno.ENOLCK, "No locks available")
+
+        monkeypatch.setattr(pytest.importorskip("fcntl"), "flock", none)
+    with alone_in(tmp_path), alone_in(tmp_path):
+        pass
+    assert left.exists(), "it might be another's"
+
+
+def test_what_killed_bakes_left_goes_and_what_others_put_there_stays(baked: Path, cornell: Scene, tmp_path: Path) -> None:
+    folder = tmp_path / "dataset"
+    shutil.copytree(baked, folder)
+    for name in (".dataset.json.7.tmp.json", "direct/.000000.exr.25623.tmp.exr", "train-0.part", "test-1.part", "test-1.json"):
+        (folder / name).write_text("")
+    for name in ("notes.txt", ".mine.tmp", "direct/.mine.tmp.exr", "direct/000000.tmp"):
+        (folder / name).write_text("mine")
+    bake(cornell, config=small(), out=folder)
+    assert {name for name, data in files(folder).items() if data == b"mine"} == set(files(folder)) - set(files(baked))
+    assert len(files(folder)) == len(files(baked)) + 4
+
+
+def test_a_bake_that_lost_lines_of_its_manifest_does_not_end_well(
+    cornell: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where there is no lock and another bake cuts the manifest to what itself has written."""
+    run = IndirectBake.run
+
+    def losing(self: IndirectBake, split: str, indices: list[int]) -> None:
+        run(self, split, indices)
+        path = self.dataset.folder / "manifest.jsonl"
+        if split == "test":
+            path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:-3]))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(IndirectBake, "run", losing)
+        with pytest.raises(UserError, match=r"got 3 files missing at the end of the bake \(first noise/000006\.exr\)"):
+            bake(cornell, config=small(), out=tmp_path / "dataset")
+    bake(cornell, config=small(), out=tmp_path / "dataset")
+    open_dataset(tmp_path / "dataset")
+
+
+@pytest.mark.parametrize("altered", ["direct/000002.exr", "indirect/000007.exr", "measured/000001.safetensors"])
+def test_altered_files_are_named_and_the_advice_works(
+    altered: str, baked: Path, cornell: Scene, tmp_path: Path, capfd: pytest.CaptureFixture
+) -> None:
+    folder = tmp_path / "dataset"
+    shutil.copytree(baked, folder)
+    data = bytearray((folder / altered).read_bytes())
+    data[len(data) // 2] ^= 1
+    (folder / altered).write_bytes(data)
+    (folder / "indirect" / "000002.exr").unlink()  # which needs the direct light of all
+    with pytest.raises(UserError, match=f"expected what was baked: {altered}; delete it and bake again") as caught:
+        bake(cornell, config=small(), out=folder)
+    assert "\n" not in str(caught.value)
+    assert capfd.readouterr() == ("", "")
+    (folder / altered).unlink()
+    bake(cornell, config=small(), out=folder)
+    assert {**files(folder), "manifest.jsonl": b""} == {**files(baked), "manifest.jsonl": b""}
+
+
+def test_a_map_that_cannot_be_read_says_what_to_do(baked: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "dataset"
+    shutil.copytree(baked, folder)
+    os.truncate(folder / "indirect" / "000005.exr", 99)
+    with pytest.raises(UserError, match=r"not a whole EXR image .*; delete it and bake again, or copy it again"):
+        open_dataset(folder).maps("indirect", [5])
+
+
 @pytest.mark.parametrize("damage", ["flip", "truncate", "remove"])
 def test_verify_finds_damage(damage: str, baked: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     from ddprt.cli import main
@@ -182,6 +340,61 @@ def test_another_bake_is_never_overwritten(baked: Path, cornell: Scene, furnace:
     (changed / "dataset.json").write_text("{")
     with pytest.raises(UserError, match="not a dataset description"):
         open_dataset(changed)
+
+
+ASKED = {
+    "noise": ({"transport": {"target_noise": 0.04}}, "transport.target_noise: holds 0.01, asked 0.04"),
+    "rays": ({"transport": {"samples": 17}}, "transport.samples: holds 16, asked 17"),
+    "automatic rays": ({"transport": {"samples": "auto"}}, 'transport.samples: holds 16, asked "auto"'),
+    "points": (
+        {"points": {"count": 9, "on": "hull"}},
+        'points.count: holds 8, asked 9; points.on: holds "surface", asked "hull"',
+    ),
+    "lightings": ({"lightings": {"train": 5}}, "lightings.train: holds 4, asked 5"),
+    "places": ({"lightings": {"clearance": 0.06}}, "lightings[2].lights[0].position[0]: holds 0.284"),
+}
+
+
+@pytest.mark.parametrize("name", ASKED)
+def test_another_dataset_is_refused_before_anything_is_built(
+    name: str, baked: Path, cornell: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(generate, "build_open_atlas", lambda *_: pytest.fail("the atlas was built"))
+    changes, words = ASKED[name]
+    with pytest.raises(UserError, match=re.escape(f"{baked}: holds another dataset ({words}")):
+        bake(cornell, config=small(**changes), out=baked)
+
+
+def test_faults_of_given_points_come_before_the_atlas(cornell: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "points.json"
+    place = {"position": [0.3, 0.0, 0.05], "normal": [0, 1, 0]}
+    path.write_text(json.dumps([place] * 3))
+    bake(cornell, config=small(points={"file": str(path), "count": 3}), out=tmp_path / "dataset")
+    path.write_text(json.dumps([{**place, "position": [0.2, 0.0, 0.05]}] * 3))
+    monkeypatch.setattr(generate, "build_open_atlas", lambda *_: pytest.fail("the atlas was built"))
+    for count, file, words in (
+        (3, path, r'holds another dataset \(points\.digest: holds "\w{16}", asked "\w{16}"\)'),
+        (4, path, r"points\.count: holds 3, asked 4"),
+        (3, tmp_path / "none.json", r'points\.file: holds "/.*/points\.json", asked "/.*/none\.json"\)'),
+    ):
+        with pytest.raises(UserError, match=words):
+            bake(cornell, config=small(points={"file": str(file), "count": count}), out=tmp_path / "dataset")
+    for count, file, words in ((4, path, "points.count: got 4, but .* has 3"), (3, tmp_path / "none.json", "got No such file")):
+        with pytest.raises(UserError, match=words):
+            bake(cornell, config=small(points={"file": str(file), "count": count}), out=tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+
+
+def test_differences_are_told_leaf_by_leaf() -> None:
+    holds = {"seed": 1, "transport": {"samples": 3, "old": True}, "scene": {"notes": ["a" * 80]}, "lightings": []}
+    asked = {"seed": 2, "transport": {"samples": 3, "new": None}, "scene": {"notes": ["a" * 80, "b"]}}
+    assert differences(holds, holds) == ""
+    assert differences(holds, asked) == (
+        "seed: holds 1, asked 2; transport.new: holds nothing, asked null; transport.old: holds true, asked nothing; "
+        "scene.notes: holds a list of 1, asked a list of 2"
+    )
+    assert differences({"a": [1, 2]}, {"a": [1, 3]}) == "a[1]: holds 2, asked 3"
+    assert differences({"a": [0] * 6}, {"a": [1] * 6}).endswith("a[3]: holds 0, asked 1; and 2 more")
 
 
 def test_unfinished_and_missing_datasets_are_refused(baked: Path, tmp_path: Path) -> None:
@@ -246,7 +459,26 @@ def test_dark_and_blocked_lightings_are_named(cornell: Scene, capsys: pytest.Cap
 def test_all_dark_is_an_error(records: tuple, cornell: Scene, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="all 3 light nothing"):
         bake(cornell, lightings(*records), config=small(), out=tmp_path / "dataset")
+    assert not (tmp_path / "dataset").exists()
     bake(cornell, lightings(LAMP, LAMP, LAMP), config=small(), out=tmp_path / "dataset")  # nothing is in the way
+
+
+def test_a_bake_of_darkness_removes_only_what_it_wrote(cornell: Scene, tmp_path: Path) -> None:
+    (tmp_path / "direct").mkdir()
+    for name in ("thesis.txt", "direct/thesis.txt"):
+        (tmp_path / name).write_text("mine")
+    with pytest.raises(UserError, match="all 3 light nothing"):
+        bake(cornell, lightings(OFF, OFF, OFF), config=small(), out=tmp_path)
+    assert files(tmp_path) == {"thesis.txt": b"mine", "direct/thesis.txt": b"mine"}
+
+
+def test_a_manifest_without_its_description_does_not_count(baked: Path, cornell: Scene, tmp_path: Path) -> None:
+    folder, config = tmp_path / "dataset", small(transport={"samples": 17})
+    shutil.copytree(baked, folder)
+    (folder / "dataset.json").unlink()
+    bake(cornell, config=config, out=folder)
+    bake(cornell, config=config, out=tmp_path / "fresh")
+    assert files(folder) == files(tmp_path / "fresh")
 
 
 def test_a_refused_bake_is_not_in_the_way_of_the_next(cornell: Scene, tmp_path: Path) -> None:

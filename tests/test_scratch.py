@@ -125,6 +125,16 @@ def test_damage_begins_anew(tmp_path: Path, damage: str) -> None:
     assert again(path).done == 1
 
 
+@pytest.mark.parametrize("key", [KEY, {"seed": 2}])
+def test_beginning_anew_takes_nothing_from_who_is_still_at_work(tmp_path: Path, key: dict[str, Any]) -> None:
+    """Where no lock keeps two bakes apart, each has maps of its own."""
+    made = Scratch(tmp_path / "maps.part", SHAPE, KEY)
+    made.maps[:] = 1
+    made.advance()
+    again(made.path, key=key).maps[:] = 2
+    np.testing.assert_array_equal(made.maps, np.ones(SHAPE, np.float32))
+
+
 @pytest.mark.parametrize("reason", ["maps gone", "maps cut", "another key"])
 def test_an_old_journal_never_speaks_for_new_maps(tmp_path: Path, reason: str) -> None:
     """Begun anew and killed before the first entry: nothing of the new maps is done, whatever was done of the old ones."""

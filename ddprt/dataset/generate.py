@@ -4,7 +4,7 @@ What a stage needs is read back from the files of the stage before it, never fro
 gives the same bits as one that was never stopped.
 """
 
-import shutil
+import json
 import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -18,10 +18,11 @@ from ddprt.config import Config, checked
 from ddprt.dataset import store
 from ddprt.dataset.denoise import find_denoiser
 from ddprt.dataset.indirect import IndirectBake
+from ddprt.dataset.scratch import remove_left
 from ddprt.dataset.splits import SPLITS, Splits, choose_lightings, doubt
 from ddprt.dataset.store import Dataset, Manifest, map_name
 from ddprt.errors import UserError
-from ddprt.files import write_tensors
+from ddprt.files import alone_in, write_tensors
 from ddprt.lights import Lighting, lighting_json
 from ddprt.progress import Progress
 from ddprt.sampling.points import Samples, load_samples, place_samples
@@ -34,7 +35,10 @@ from ddprt.transport.measure import measure
 from ddprt.transport.openness import build_open_atlas
 
 DEPTH = 0.75  # of the distance between samples: what they mistake for a constant shrinks to 1.8 %
-_NAMED = 8  # doubtful lightings that a warning spells out
+_NAMED = 8  # doubtful lightings, or altered files, that a message spells out
+_TOLD = 4  # settings that differ and that a message spells out
+_WIDTH = 60  # characters of a value in a message
+_SAID = {"placing": "points", "counts": "lightings"}  # what dataset.json calls otherwise than the configuration does
 
 
 def bake(
@@ -65,8 +69,9 @@ def bake(
     Returns:
       The finished dataset.
     Raises:
-      UserError: no lightings, all of them dark, too many points, a folder that holds another dataset, a setting out of its
-        range, or a configuration together with one of the settings that it replaces.
+      UserError: no lightings, all of them dark, too many points, a folder that holds another dataset or altered files or that
+        another bake is working in, a setting out of its range, or a configuration together with one of the settings that it
+        replaces.
     Warns:
       Doubt: lamps that light nothing, light that does not die away, noise that is not reached; where progress is shown, these
         are lines of it.
@@ -98,14 +103,46 @@ def baked_settings(config: Config, scene: Scene) -> dict[str, Any]:
     }
 
 
-def other_settings(description: dict[str, Any], config: Config, scene: Scene) -> list[str]:
-    """Names of the settings in which a baked dataset differs from a configuration; empty where it is the same."""
+def other_settings(description: dict[str, Any], config: Config, scene: Scene) -> str:
+    """The settings in which a baked dataset differs from a configuration, in words; empty where it is the same."""
     wanted: dict[str, Any] = baked_settings(config, scene)
     if not config.lightings.file:
-        splits = [entry["split"] for entry in description["lightings"]]
         wanted["counts"] = {name: getattr(config.lightings, name) for name in SPLITS}
-        description = {**description, "counts": {name: splits.count(name) for name in SPLITS}}
-    return [name for name, value in wanted.items() if description.get(name) != value]
+    return differences(description, wanted)
+
+
+def differences(description: dict[str, Any], wanted: dict[str, Any]) -> str:
+    """Where a baked dataset differs from what is asked for: "transport.samples: holds 16, asked 17"; empty if nowhere."""
+    holds = {**description, "counts": _counts(description.get("lightings", []))}
+    lines: list[str] = []
+    for key, value in wanted.items():
+        _compare(_SAID.get(key, key), holds.get(key, ...), value, lines)
+    more = [f"and {len(lines) - _TOLD} more"] if len(lines) > _TOLD else []
+    return "; ".join(lines[:_TOLD] + more)
+
+
+def _counts(entries: Sequence[dict[str, Any]]) -> dict[str, int]:
+    splits = [entry["split"] for entry in entries]
+    return {name: splits.count(name) for name in SPLITS}
+
+
+def _compare(name: str, holds: Any, asked: Any, lines: list[str]) -> None:
+    """Adds a line for every leaf that differs; the ellipsis stands for what is not there."""
+    if isinstance(holds, dict) and isinstance(asked, dict):
+        for key in dict.fromkeys([*asked, *holds]):
+            _compare(f"{name}.{key}", holds.get(key, ...), asked.get(key, ...), lines)
+    elif isinstance(holds, list) and isinstance(asked, list) and len(holds) == len(asked):
+        for index, (one, other) in enumerate(zip(holds, asked, strict=True)):
+            _compare(f"{name}[{index}]", one, other, lines)
+    elif holds != asked:
+        lines.append(f"{name}: holds {_shown(holds)}, asked {_shown(asked)}")
+
+
+def _shown(value: Any) -> str:
+    words = "nothing" if value is ... else json.dumps(value)
+    if len(words) <= _WIDTH:
+        return words
+    return f"a list of {len(value)}" if isinstance(value, list) else f"{words[: _WIDTH // 2]}...{words[-_WIDTH // 2 :]}"
 
 
 def check_points(config: Config, scene: Scene, atlas: Atlas) -> None:
@@ -122,6 +159,10 @@ def check_points(config: Config, scene: Scene, atlas: Atlas) -> None:
         )
 
 
+def _records(entries: Sequence[tuple[str, Lighting]]) -> list[dict[str, Any]]:
+    return [{"split": split, "lights": lighting_json(lighting)} for split, lighting in entries]
+
+
 class _Bake:
     """One bake from start to end; every stage skips what the manifest already holds."""
 
@@ -132,10 +173,24 @@ class _Bake:
     def run(self, given: Sequence[Lighting] | Splits | None, keep_alive: Any) -> Dataset:
         if self.config.transport.denoise:
             find_denoiser()
+        with alone_in(self.folder):
+            return self._alone(given, keep_alive)
+
+    def _alone(self, given: Sequence[Lighting] | Splits | None, keep_alive: Any) -> Dataset:
+        there = store.read_description(self.folder) if (self.folder / "dataset.json").exists() else None
+        if there is not None:
+            self._refuse_other(there, baked_settings(self.config, self.scene))
+            self._refuse_altered()
+        listed = self._listed()
         with self.progress.stage("lightings") as stage:
             entries, drawn = choose_lightings(given, self.config.lightings, self.scene, self.tracer, self.config.seed)
             stage.facts |= {"lightings": len(entries), **drawn}
-        effects = plan(self.scene, [lighting for _, lighting in entries], bounces=self.config.transport.bounces)
+        lightings = [lighting for _, lighting in entries]
+        listed = listed and self._sunk(listed, lightings)
+        if there is not None:
+            points = {"points": self._points(listed)} if listed else {}
+            self._refuse_other(there, {"counts": _counts(_records(entries)), "lightings": _records(entries), **points})
+        effects = plan(self.scene, lightings, bounces=self.config.transport.bounces)
         if self.config.transport.integrator in ("paths", "reference"):  # the operator tells what it left out, if anything
             for effect in effects.effects:
                 if effect.bound is None and not effect.forced:
@@ -145,19 +200,36 @@ class _Bake:
             atlas, hidden = build_open_atlas(self.tracer, self.scene, settings.resolution, settings.padding)
             stage.facts |= {"texels": atlas.count, "texels_per_metre": round(atlas.texels_per_metre, 3), **hidden}
         with self.progress.stage("points") as stage:
-            samples = self._sunk(self._samples(atlas), [lighting for _, lighting in entries])
+            samples = listed or self._sunk(self._placed(atlas), lightings)
             stage.facts |= {"samples": len(samples.position), "depth": round(samples.depth, 6)}
         description = self._description(entries, effects, drawn, samples)
-        fresh = self._claim(description)
+        if there is None:
+            (self.folder / "manifest.jsonl").unlink(missing_ok=True)  # it tells of a dataset that nobody knows any more
+            store.write_description(self.folder, description)
+        else:
+            self._refuse_other(there, {key: value for key, value in description.items() if key != "ddprt"})
         manifest = Manifest(self.folder)
         self._write_places(manifest, atlas, samples)
         dataset = Dataset(self.folder, description, keep_alive)
         self._direct(dataset, manifest, atlas, samples)
-        self._judge_lightings(dataset, fresh)
+        self._judge_lightings(dataset, fresh=there is None)
         indirect = IndirectBake(self.config, self.scene, self.tracer, atlas, effects, dataset, manifest, self.progress)
         indirect.run("train", dataset.split("train") + dataset.split("validation"))
         indirect.run("test", dataset.split("test"))
+        self._end(description)
         return dataset
+
+    def _end(self, description: dict[str, Any]) -> None:
+        """Makes sure that all is there, by the manifest on disk; what a bake killed near its end left behind goes."""
+        manifest, expected = Manifest(self.folder), store.expected_files(description)
+        missing = [name for name in expected if not manifest.holds(name)]
+        if missing:
+            raise UserError(
+                f"{self.folder}: got {len(missing)} files missing at the end of the bake (first {missing[0]}), expected all "
+                f"{len(expected)}; see that nothing else changes this folder, and bake again to go on"
+            )
+        for part in self.folder.glob("*-[01].part"):
+            remove_left(part)
 
     def _description(
         self, entries: Sequence[tuple[str, Lighting]], effects: Plan, drawn: dict[str, int], samples: Samples
@@ -168,41 +240,50 @@ class _Bake:
             **baked_settings(self.config, self.scene),
             "quantity": "irradiance",
             "unit": "W/m2",
-            "points": {"count": self.config.points.count, "digest": samples.digest},
+            "points": self._points(samples),
             "plan": [asdict(effect) for effect in effects.effects],
             "drawn": drawn,
-            "lightings": [{"split": split, "lights": lighting_json(lighting)} for split, lighting in entries],
+            "lightings": _records(entries),
         }
 
-    def _claim(self, description: dict[str, Any]) -> bool:
-        """Writes dataset.json (True), or makes sure that what lies there is this very bake (False)."""
-        if not (self.folder / "dataset.json").exists():
-            store.write_description(self.folder, description)
-            return True
-        there = store.read_description(self.folder)
-        differs = [key for key in description if key != "ddprt" and there.get(key) != description[key]]
-        if differs:
-            name = there.get("scene", {}).get("name")
-            raise UserError(
-                f'{self.folder}: holds another dataset (scene "{name}"; {", ".join(differs)} differ); '
-                "choose another --out, or delete that folder"
-            )
-        return False
+    def _points(self, samples: Samples) -> dict[str, Any]:
+        return {"count": self.config.points.count, "digest": samples.digest}
 
-    def _samples(self, atlas: Atlas) -> Samples:
+    def _refuse_other(self, there: dict[str, Any], wanted: dict[str, Any]) -> None:
+        """Makes sure that what lies in the folder is, so far, this very bake."""
+        differs = differences(there, wanted)
+        if differs:
+            raise UserError(f"{self.folder}: holds another dataset ({differs}); choose another --out, or delete that folder")
+
+    def _refuse_altered(self) -> None:
+        """Makes sure that what the bake goes on from is what was baked; files lost or cut short are made again unasked."""
+        manifest = Manifest(self.folder)
+        names = [name for name in manifest.entries if manifest.holds(name)]
+        altered = [name for name, fits in zip(names, self.tracer.map(manifest.fits, names), strict=True) if not fits]
+        if altered:
+            more = f" and {len(altered) - _NAMED} more" if len(altered) > _NAMED else ""
+            raise UserError(
+                f"{self.folder}: got contents that differ from their hash in manifest.jsonl, expected what was baked: "
+                f"{', '.join(altered[:_NAMED])}{more}; delete {'it' if len(altered) == 1 else 'them'} and bake again"
+            )
+
+    def _listed(self) -> Samples | None:
+        """The points of `points.file`, if it is given."""
         config = self.config.points
-        if config.file:
-            samples = load_samples(config.file)
-            if len(samples.position) < config.count:
-                raise UserError(
-                    f"points.count: got {config.count}, but {config.file} has {len(samples.position)}; "
-                    "lower points.count or list more points"
-                )
-        else:
-            check_points(self.config, self.scene, atlas)
-            count = config.count * config.supersample
-            samples = place_samples(self.scene, count, on=config.on, seed=self.config.seed, atlas=atlas)
+        if not config.file:
+            return None
+        samples = load_samples(config.file)
+        if len(samples.position) < config.count:
+            raise UserError(
+                f"points.count: got {config.count}, but {config.file} has {len(samples.position)}; "
+                "lower points.count or list more points"
+            )
         return samples
+
+    def _placed(self, atlas: Atlas) -> Samples:
+        check_points(self.config, self.scene, atlas)
+        config = self.config.points
+        return place_samples(self.scene, config.count * config.supersample, on=config.on, seed=self.config.seed, atlas=atlas)
 
     def _sunk(self, samples: Samples, lightings: Sequence[Lighting]) -> Samples:
         """Samples that are lit from behind their surface where lamps are nearer to one than samples to each other."""
@@ -280,7 +361,7 @@ class _Bake:
                 faults.append(f"{index} ({dataset.description['lightings'][index]['split']}): {why}")
         if dark == len(dataset.lightings):
             if fresh:  # nothing in it is worth keeping, and it would be in the way of the next try
-                shutil.rmtree(self.folder)
+                store.discard(self.folder)
             raise UserError(
                 f"lightings: all {dark} light nothing, expected light on the scene; the first: {faults[0]}; "
                 "check positions, directions and intensities"

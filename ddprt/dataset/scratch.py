@@ -44,7 +44,8 @@ class Scratch:
         try:
             if not self.done:
                 self.journal.unlink(missing_ok=True)  # it must never speak for what comes now
-                with path.open("wb") as file:
+                path.unlink(missing_ok=True)  # never cut: another process might still have it mapped
+                with path.open("xb") as file:
                     os.posix_fallocate(file.fileno(), 0, 4 * int(np.prod(shape)))  # full: an error now, no signal later
             self.maps = np.memmap(path, np.float32, "r+", shape=shape)
         except OSError as error:
@@ -76,5 +77,10 @@ class Scratch:
     def remove(self) -> None:
         """The maps are in their own files now."""
         del self.maps
-        for path in (self.journal, self.path):
-            path.unlink(missing_ok=True)
+        remove_left(self.path)
+
+
+def remove_left(path: Path) -> None:
+    """Removes maps in the making and their journal."""
+    for left in (path.with_suffix(".json"), path):
+        left.unlink(missing_ok=True)

@@ -9,6 +9,7 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -239,6 +240,10 @@ class Manifest:
         path = self.folder / name
         return entry is not None and path.is_file() and path.stat().st_size == entry["bytes"]
 
+    def fits(self, name: str) -> bool:
+        """Whether the contents of a named file are those of its hash."""
+        return bool(_sha256(self.folder / name) == self.entries[name]["sha256"])
+
     def lacks(self, kinds: Sequence[str], indices: Iterable[int]) -> list[int]:
         """The lightings that some kind of map is still missing of."""
         return [index for index in indices if not all(self.holds(map_name(kind, index)) for kind in kinds)]
@@ -252,7 +257,7 @@ class Manifest:
                 faults.append(f"{name}: missing")
             elif path.stat().st_size != entry["bytes"]:
                 faults.append(f"{name}: got {path.stat().st_size} bytes, expected {entry['bytes']}")
-            elif _sha256(path) != entry["sha256"]:
+            elif not self.fits(name):
                 faults.append(f"{name}: contents differ from their hash")
         return faults
 
@@ -298,6 +303,16 @@ def write_description(folder: Path, description: dict[str, Any]) -> None:
     """dataset.json, whole or not at all."""
     make_folder(folder)
     write_text(folder / "dataset.json", json.dumps(description, indent=1) + "\n")
+
+
+def discard(folder: Path) -> None:
+    """Removes what a bake wrote into a folder; what else lies there stays."""
+    names = list(Manifest(folder).entries)
+    for name in (*names, "manifest.jsonl", "dataset.json"):
+        (folder / name).unlink(missing_ok=True)
+    for part in {folder / name for name in names}:
+        with suppress(OSError):  # the folder itself, or one that is not empty
+            part.parent.rmdir()
 
 
 def _refuse_odd(path: Path, values: np.ndarray, *, signed: bool = False) -> None:

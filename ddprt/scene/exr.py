@@ -71,7 +71,9 @@ def read_exr(path: Path) -> tuple[Float[np.ndarray, "height width channels"], di
     except UserError:
         raise
     except Exception as error:
-        raise UserError(f"{path}: not a whole EXR image ({str(error).splitlines()[0]}); bake or copy it again") from None
+        raise UserError(
+            f"{path}: not a whole EXR image ({str(error).splitlines()[0]}); delete it and bake again, or copy it again"
+        ) from None
     raise UserError(f"{path}: got channels {names}, expected RGB, RGBA or Y")
 
 
