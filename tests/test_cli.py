@@ -413,7 +413,7 @@ def test_inspect_says_what_is_too_wide_a_berth(capsys: pytest.CaptureFixture) ->
     assert call("inspect", "cornell", "--atlas.resolution", "32", "--lightings.clearance", "9") == 0
     text = capsys.readouterr().out
     assert "lower lightings.clearance" in text
-    assert '"around"' not in text
+    assert "as is assumed below" not in text
     assert "point lights" not in text, "without a lighting nobody knows"
 
 
