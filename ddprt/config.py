@@ -26,10 +26,8 @@ class Section(BaseModel):
 
     @field_validator("*", mode="before")
     @classmethod
-    def _truth_is_no_number(cls, value: Any, info: Any) -> Any:
-        """`true` would pass for 1: where no truth value belongs, it is taken for the word."""
-        if cls.model_fields[info.field_name].annotation is bool:
-            return value
+    def _truth_is_no_number(cls, value: Any) -> Any:
+        """`true` would pass for 1: it is taken for the word, which a truth value accepts and a number does not."""
         if isinstance(value, list):
             return [str(entry).lower() if isinstance(entry, bool) else entry for entry in value]
         return str(value).lower() if isinstance(value, bool) else value
