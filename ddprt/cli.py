@@ -1,4 +1,4 @@
-"""The command line: `ddprt VERB [FILE] [--option value] [--section.key value]`.
+"""The command line: `ddprt VERB FILE [--option value] [--section.key value]`.
 
 Exit 0 done, 2 the user can mend it (one line), 1 our fault, 130 interrupted and resumable. Imports stay inside the verbs,
 so that help is instant.
@@ -48,9 +48,22 @@ class Call:
         from ddprt.pipeline import Run
 
         source = self.file("a configuration such as configs/cornell.toml")
+        if _is_scene(source):
+            raise UserError(
+                f"ddprt {self.verb}: got the scene {source}, expected a configuration; "
+                f"write ddprt {self.verb} configs/cornell.toml --scene.name {source}"
+            )
         config = load_config(source, self.overrides)
         default = Path(source).parent if Path(source).name == "config.toml" else Path("runs") / Path(source).stem
         return Run(config, Path(self.options.get("out") or default), command=self.command, quiet=self.quiet)
+
+
+def _is_scene(source: str) -> bool:
+    """Whether a scene stands where a configuration should."""
+    from ddprt.scene.files import SUFFIXES
+    from ddprt.scene.library import SCENES
+
+    return Path(source).suffix.lower() in SUFFIXES or (source in SCENES and not Path(source).is_file())
 
 
 def run(call: Call) -> None:
@@ -177,28 +190,30 @@ def doctor(call: Call) -> None:
 
 @dataclass(frozen=True)
 class Verb:
-    """One verb: its code, its own options, and whether it takes --section.key overrides."""
+    """One verb: its code, what it works on, its own options, and whether it takes --section.key overrides."""
 
     work: Callable[[Call], None]
+    file: str = "FILE.toml"
     options: dict[str, str] = field(default_factory=dict)
     configured: bool = True
 
 
 _OUT = {"out": "DIR  folder of the run (default: runs/NAME)"}
 VERBS = {
-    "run": Verb(run, _OUT),
-    "inspect": Verb(inspect),
-    "bake": Verb(bake, _OUT),
-    "fit": Verb(fit, _OUT),
-    "eval": Verb(evaluate, _OUT),
+    "run": Verb(run, options=_OUT),
+    "inspect": Verb(inspect, "FILE.toml|SCENE|MESH"),
+    "bake": Verb(bake, options=_OUT),
+    "fit": Verb(fit, options=_OUT),
+    "eval": Verb(evaluate, options=_OUT),
     "relight": Verb(
         relight,
+        "MODEL",
         {"lighting": "FILE|JSON  a list of lightings, or one as text", "out": "FILE.exr  where to (default: relit.exr)"},
         configured=False,
     ),
-    "export": Verb(export, _OUT),
-    "verify": Verb(verify, configured=False),
-    "doctor": Verb(doctor, configured=False),
+    "export": Verb(export, options=_OUT),
+    "verify": Verb(verify, "DIR", configured=False),
+    "doctor": Verb(doctor, "", configured=False),
 }
 LATER = {"bench", "tune", "import", "view", "status"}
 FLAGS = {"quiet": "no progress", "debug": "tracebacks instead of one-line errors"}
@@ -209,7 +224,7 @@ def usage() -> str:
     rows = "\n".join(f"  {name:<9}{verb.work.__doc__}" for name, verb in VERBS.items())
     return (
         f"ddprt {__version__}: learn how a scene answers to light, relight it without tracing a ray.\n\n"
-        f"usage: ddprt VERB [FILE] [--option value] [--section.key value]\n\n{rows}\n\n"
+        f"usage: ddprt VERB FILE [--option value] [--section.key value]\n\n{rows}\n\n"
         "`ddprt VERB --help` lists the options and every setting. Start with: ddprt run configs/cornell.toml\n"
     )
 
@@ -296,6 +311,10 @@ def parse(name: str, words: list[str]) -> Call:
             call.options[key] = ""
             continue
         known = key in verb.options or (verb.configured and ("." in key or key == "seed"))
+        if known and "." in key:
+            from ddprt.config import check_key
+
+            check_key(key, name)
         if not known:
             choices = [*verb.options, *FLAGS]
             if verb.configured:
@@ -307,6 +326,10 @@ def parse(name: str, words: list[str]) -> Call:
             if not queue:
                 raise UserError(f"--{key}: got no value, expected one after it; write --{key} VALUE")
             value = queue.pop(0)
+        if not value and key in verb.options:
+            raise UserError(
+                f"--{key}: got an empty value, expected {verb.options[key].split('  ')[0]}; give one or leave it out"
+            )
         (call.options if key in verb.options else call.overrides)[key] = value
     return call
 
@@ -314,7 +337,8 @@ def parse(name: str, words: list[str]) -> Call:
 def _help(name: str) -> None:
     verb = VERBS[name]
     rows = [f"  --{key} {text}" for key, text in {**verb.options, **FLAGS}.items()]
-    print(f"ddprt {name}: {verb.work.__doc__}\n\noptions:\n" + "\n".join(rows))
+    usage = f"ddprt {name} {verb.file}".rstrip()
+    print(f"{usage}: {verb.work.__doc__}\n\noptions:\n" + "\n".join(rows))
     if verb.configured:
         import tyro
 
@@ -322,4 +346,4 @@ def _help(name: str) -> None:
 
         print("\nsettings (in the file as [section] key = value, here as --section.key value):")
         print("  --methods.settings.NAME '{key = value}'  settings of one method")
-        tyro.cli(Config, args=["--help"], prog=f"ddprt {name} [FILE]", add_help=True, config=(tyro.conf.FlagConversionOff,))
+        tyro.cli(Config, args=["--help"], prog=usage, add_help=True, config=(tyro.conf.FlagConversionOff,))

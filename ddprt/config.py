@@ -10,9 +10,10 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from ddprt.errors import UserError, nearest
+from ddprt.errors import UserError, nearest, spoken
+from ddprt.errors import explain as explained
 
 Range = tuple[float, float]
 Unit = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -23,11 +24,19 @@ class Section(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
+    @field_validator("*", mode="before")
+    @classmethod
+    def _truth_is_no_number(cls, value: Any) -> Any:
+        """`true` would pass for 1: it is taken for the word, which a truth value accepts and a number does not."""
+        if isinstance(value, list):
+            return [str(entry).lower() if isinstance(entry, bool) else entry for entry in value]
+        return str(value).lower() if isinstance(value, bool) else value
+
 
 class SceneConfig(Section):
     """What stays still."""
 
-    name: str = Field("cornell", description="a name of SCENES, or a path to an .obj, .ply or .glb file")
+    name: str = Field("cornell", description="a name of SCENES, or a path to an .obj, .ply, .stl, .gltf or .glb file")
     parameters: dict[str, float] = Field({}, description="numbers that a scene in code takes, e.g. {albedo = 0.5}")
 
 
@@ -56,7 +65,9 @@ class LightingsConfig(Section):
         (0.0, 0.0, 0.0), description="room: lowest lamp position as fractions of the bounding box (x, y, z)"
     )
     region_high: tuple[Unit, Unit, Unit] = Field((1.0, 1.0, 1.0), description="room: highest lamp position, likewise")
-    clearance: float = Field(0.05, ge=0.0, description="room: metres to keep from every surface")
+    clearance: float = Field(
+        0.05, ge=0.0, description="room: metres to keep from every surface, whatever the size of the scene"
+    )
     distance: Range = Field((1.5, 3.0), description="around: distance from the asset's centre in bounding radii")
     elevation_deg: Range = Field((0.0, 90.0), description="around: height above the horizon")
     intensity: tuple[Annotated[float, Field(gt=0, le=1e25)], Annotated[float, Field(gt=0, le=1e25)]] = Field(
@@ -95,7 +106,9 @@ class PointsConfig(Section):
 
     count: int = Field(128, ge=1, description="measurement points")
     supersample: int = Field(8, ge=1, le=64, description="samples averaged into each point")
-    on: Literal["surface", "hull"] = Field("surface", description="the scene's surface, or its convex hull")
+    on: Literal["surface", "hull"] = Field(
+        "surface", description="the scene's surface, or its convex hull (for assets seen from outside)"
+    )
     depth: Literal["auto"] | Annotated[float, Field(ge=0, le=8)] = Field(
         "auto",
         description="how far behind its surface a sample is lit, in distances between samples, to even out what lamps nearer "
@@ -231,7 +244,7 @@ def load_config(path: str | Path | None, overrides: dict[str, str] | None = None
             ) from None
     overrides = {_as_written(dotted): text for dotted, text in (overrides or {}).items()}
     for dotted, text in overrides.items():
-        _check_key(dotted)
+        check_key(dotted)
         *parents, leaf = dotted.split(".")
         table = document
         for parent in parents:
@@ -270,10 +283,8 @@ def explain(error: ValidationError, path: str | Path | None, overrides: dict[str
     """First fault of a pydantic error as one line: file, key, got, expected, what to do."""
     faults = error.errors()
     fault = faults[0]
-    place, text = [str(part) for part in fault["loc"]], ""
-    if fault["type"] == "value_error":  # of a whole section: its text begins with the key
-        key, _, text = str(fault["ctx"]["error"]).partition(": ")
-        place.append(key)
+    key, text = spoken(fault)
+    place = [str(part) for part in (*fault["loc"], key) if part != ""]
     dotted = next((key for n in range(len(place), 0, -1) if (key := ".".join(place[:n])) in keys()), ".".join(place))
     source = f"--{dotted}" if dotted in overrides else f"{path or 'configuration'}: {dotted}"
     if fault["type"] == "extra_forbidden":
@@ -283,42 +294,17 @@ def explain(error: ValidationError, path: str | Path | None, overrides: dict[str
         return f"{source}: unknown key{nearest(place[-1], names)}; known here: {', '.join(names)}"
     if text:
         return f"{source}: {text}"
-    related = [other for other in faults if ".".join(map(str, other["loc"])).startswith(dotted)]
-    expected = " or ".join(dict.fromkeys(_expected(other) for other in related))
-    return f"{source}: got {fault['input']!r}, expected {expected}; {_remedy(dotted, related)}"
-
-
-def _expected(fault: Any) -> str:
-    text = fault["msg"].removeprefix("Input should be ").removeprefix("a valid ")
-    return text.removeprefix("Input should have ").split(", unable")[0]
-
-
-def _remedy(dotted: str, faults: list[Any]) -> str:
-    """What to do about the faults of one key: its nearest spelling, which way to go, or back to the default."""
-    kinds = {fault["type"] for fault in faults}
-    for fault in faults:
-        if fault["type"] == "literal_error" and isinstance(fault["input"], str):
-            choices = fault["ctx"]["expected"].replace("'", "").replace(" or ", ", ").split(", ")
-            hint = nearest(fault["input"], choices)
-            if hint:
-                return hint.removeprefix("; ")
-    if kinds & {"greater_than", "greater_than_equal"}:
-        return "raise it"
-    if kinds & {"less_than", "less_than_equal"}:
-        return "lower it"
-    return f"mend it, or leave it out for the default{_default(dotted)}"
-
-
-def _default(dotted: str) -> str:
-    """ ", 16" for a key with such a default; empty for a section and what lies below a key."""
-    value: Any = Config()
+    # A list whose entries are faulty counts as short of them, too.
+    related = [
+        other
+        for other in faults
+        if ".".join(map(str, other["loc"])).startswith(dotted) and (other is fault or other["type"] != "too_short")
+    ]
+    default: Any = Config()
     for part in dotted.split("."):
-        value = getattr(value, part, None)
-    return (
-        ""
-        if value is None or isinstance(value, Section | dict)
-        else f", {_toml(list(value) if isinstance(value, tuple) else value)}"
-    )
+        default = getattr(default, part, None)
+    shown = "" if default is None or isinstance(default, Section | dict) else f", {_toml(default)}"
+    return f"{source}: {explained(related, default, f'mend it, or leave it out for the default{shown}')}"
 
 
 def _as_written(dotted: str) -> str:
@@ -327,11 +313,15 @@ def _as_written(dotted: str) -> str:
     return plain if plain in keys() else dotted
 
 
-def _check_key(dotted: str) -> None:
-    known = keys()
-    free = ("scene.parameters.", "methods.settings.")
-    if dotted not in known and not dotted.startswith(free):
-        raise UserError(f"--{dotted}: unknown key{nearest(dotted, known)}; `ddprt run --help` lists all")
+def check_key(dotted: str, verb: str = "run") -> None:
+    """Makes sure that `--dotted` is a setting.
+
+    Raises:
+      UserError: it is not; `verb` is the one whose help is named.
+    """
+    known, free = keys(), ("scene.parameters.", "methods.settings.")
+    if _as_written(dotted) not in known and not dotted.startswith(free):
+        raise UserError(f"--{dotted}: unknown key{nearest(dotted, known)}; `ddprt {verb} --help` lists all")
 
 
 def _literal(text: str) -> Any:
@@ -345,7 +335,7 @@ def _literal(text: str) -> Any:
 def _toml(value: Any) -> str:
     if isinstance(value, dict):
         return "{" + ", ".join(f"{json.dumps(key)} = {_toml(item)}" for key, item in value.items()) + "}"
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_toml, value)) + "]"
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")  # TOML allows no raw DEL

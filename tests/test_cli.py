@@ -134,6 +134,14 @@ FAULTS = {
     "unknown verb": (["rnu"], 'no verb "rnu"; did you mean "run"?'),
     "later verb": (["view", "x"], "not built yet"),
     "no file": (["run"], "got 0 files, expected a configuration"),
+    "a scene for a configuration": (
+        ["bake", "cornell"],
+        "got the scene cornell, expected a configuration; write ddprt bake configs/cornell.toml --scene.name cornell",
+    ),
+    "a mesh for a configuration": (["run", "room.GLB"], "configs/cornell.toml --scene.name room.GLB"),
+    "empty folder": (["run", "{job}", "--out", ""], "--out: got an empty value, expected DIR; give one or leave it out"),
+    "empty folder after =": (["fit", "{job}", "--out="], "--out: got an empty value, expected DIR"),
+    "unknown setting of bake": (["bake", "{job}", "--fit.basis", "3"], "`ddprt bake --help` lists all"),
     "missing file": (["run", "nothing.toml"], "expected a readable TOML file"),
     "unknown option": (["run", "{job}", "--otu", "x"], '--otu: unknown option; did you mean "out"?'),
     "option without value": (["run", "{job}", "--fit.bases"], "--fit.bases: got no value"),
@@ -220,6 +228,20 @@ def test_verb_help_lists_every_setting(capsys: pytest.CaptureFixture) -> None:
     assert "--out" in text
     squeezed = "".join(text.split())
     assert [key for key in keys() if f"--{key.replace('_', '-')}" not in squeezed and f"--{key}" not in squeezed] == []
+
+
+def test_help_says_what_a_verb_works_on(capsys: pytest.CaptureFixture) -> None:
+    assert call("--help") == 0
+    assert "usage: ddprt VERB FILE [" in capsys.readouterr().out
+    for name, verb in VERBS.items():
+        assert call(name, "--help") == 0
+        text = capsys.readouterr().out
+        assert text.startswith(f"ddprt {name} {verb.file}".rstrip() + ": ")
+        assert "[FILE]" not in text
+    assert call("bake", "--help") == 0
+    squeezed = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "for assets seen from outside" in squeezed
+    assert "metres to keep from every surface, whatever the size of the scene" in squeezed
 
 
 def test_more_bases_than_rank_is_a_warning(job: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -391,7 +413,7 @@ def test_inspect_says_what_is_too_wide_a_berth(capsys: pytest.CaptureFixture) ->
     assert call("inspect", "cornell", "--atlas.resolution", "32", "--lightings.clearance", "9") == 0
     text = capsys.readouterr().out
     assert "lower lightings.clearance" in text
-    assert '"around"' not in text
+    assert "as is assumed below" not in text
     assert "point lights" not in text, "without a lighting nobody knows"
 
 

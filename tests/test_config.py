@@ -76,7 +76,18 @@ FAULTS = {
     "no lights": ("[lightings]\nlights = [0, 1]\n", {}, ["lightings.lights: got 0", "at least 1; raise it"]),
     "falling override": ("", {"lightings.intensity": "[2, 1]"}, ["--lightings.intensity: got [2, 1]", "; swap them"]),
     "zero lightings": ("[lightings]\ntrain = 0\n", {}, ["lightings.train", "got 0", "greater than or equal to 1"]),
-    "no kinds": ("[lightings]\nkinds = []\n", {}, ["lightings.kinds", "got []"]),
+    "no kinds": ("[lightings]\nkinds = []\n", {}, ["lightings.kinds", "got []", "expected at least 1 entry; mend it"]),
+    "a word for a list": ("", {"lightings.kinds": "point"}, ["got 'point', expected a list such as [\"point\"]; mend it"]),
+    "a list that lacks an end": ("[lightings]\ndistance = [1.0]\n", {}, ["got [1.0], expected at least 2 entries"]),
+    "a list with too many": ("[lightings]\ndistance = [1, 2, 3]\n", {}, ["got [1, 2, 3], expected at most 2 entries"]),
+    "an entry is told, its list is not": (
+        '[lightings]\nkinds = ["pont"]\n',
+        {},
+        ["'rect' or 'sphere'; did you mean \"point\"?"],
+    ),
+    "truth for a number": ("", {"atlas.resolution": "true"}, ["--atlas.resolution: got 'true', expected integer"]),
+    "truth for auto or a number": ("[transport]\nsamples = true\n", {}, ["transport.samples: got 'true'", "'auto' or integer"]),
+    "truth in a list": ("[lightings]\nlights = [true, 2]\n", {}, ["lightings.lights: got 'true', expected integer"]),
     "a section as a number": ("fit = 3\n", {}, ["fit", "got 3"]),
     "not TOML": ("[fit\n", {}, ["not TOML"]),
     "unknown override": ("", {"fit.basis": "3"}, ["--fit.basis", 'did you mean "fit.bases"?']),
@@ -100,6 +111,12 @@ def test_each_fault_is_one_line(name: str, tmp_path: Path) -> None:
     got, _, remedy = message.rpartition("; ")
     assert got, f"no word on what to do: {message}"
     assert remedy
+
+
+def test_truth_values_stay_where_they_belong() -> None:
+    config = load_config(None, {"transport.denoise": "true", "methods.settings.mlp": "{residual = true}"})
+    assert config.transport.denoise is True
+    assert config.methods.settings == {"mlp": {"residual": True}}
 
 
 @pytest.mark.parametrize("name", ["nothing.toml", ""])

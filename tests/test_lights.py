@@ -11,10 +11,13 @@ from oracles import above_horizon, polygon_irradiance
 from pydantic import ValidationError
 
 from ddprt import warp
+from ddprt.dataset.splits import doubt, grouped
 from ddprt.errors import UserError
 from ddprt.lights import LIGHTS, Light, lighting_json, load_lightings, parse_lighting
 from ddprt.lights.area import _turned
 from ddprt.lights.light import Illumination
+from ddprt.scene.library import build
+from ddprt.transport.embree import Tracer
 
 RECORDS: dict[str, dict[str, Any]] = {
     "point": {"type": "point", "position": [0.3, 1.2, -0.4], "intensity": [1.0, 2.0, 0.5]},
@@ -330,30 +333,48 @@ BAD: list[tuple[Any, str]] = [
     ({**RECORDS["point"], "type": "pont"}, r'\[0\]\.type: got .pont., expected one of .*did you mean "point"'),
     ({**RECORDS["point"], "type": ["point"]}, r"\[0\]\.type: got \[.point.\], expected one of"),
     (without("point", "type"), r"\[0\]\.type: got None, expected one of directional, point, rect, sphere, spot"),
-    (without("point", "intensity"), "intensity: Field required"),
-    (without("rect", "half_v"), "half_v: Field required"),
-    ({**RECORDS["point"], "colour": [1, 1, 1]}, "colour: got .*not permitted"),
-    ({**RECORDS["point"], "intensity": [1, -1, 1]}, r"intensity\.1: got -1, .*greater than or equal to 0"),
-    ({**RECORDS["sphere"], "radiance": [1, float("nan"), 1]}, r"radiance\.1: got nan, .*finite"),
-    ({**RECORDS["directional"], "irradiance": [1, 1, float("inf")]}, r"irradiance\.2: got inf, .*finite"),
-    ({**RECORDS["point"], "position": [0, float("nan"), 0]}, r"position\.1: got nan, .*finite"),
-    ({**RECORDS["point"], "position": [0, 0]}, "position"),
-    ({**RECORDS["point"], "position": [0, 0, 0, 0]}, "position"),
+    (without("point", "intensity"), r"lighting\[0\]\.intensity: got none, expected it among type, position, intensity; add it"),
+    (without("rect", "half_v"), r"\[0\]\.half_v: got none, expected it among type, center, half_u, half_v, radiance; add it"),
+    ({**RECORDS["point"], "colour": [1, 1, 1]}, r"\[0\]\.colour: unknown key; known here: type, position, intensity"),
+    ({**RECORDS["point"], "positon": [1, 1, 1]}, r'\[0\]\.positon: unknown key; did you mean "position"\?; known here: type'),
+    (
+        {**RECORDS["point"], "intensity": [1, -1, 1]},
+        r"^lighting\[0\]\.intensity\[1\]: got -1, expected greater than or equal to 0; raise it$",
+    ),
+    ({**RECORDS["point"], "position": 1}, r"\[0\]\.position: got 1, expected a list such as \[0, 1, 0\]; mend it"),
+    ({**RECORDS["point"], "position": [0, "x", 0]}, r"\[0\]\.position\[1\]: got 'x', expected number; mend it"),
+    ({**RECORDS["sphere"], "radiance": [1, float("nan"), 1]}, r"radiance\[1\]: got nan, expected a finite number; mend it"),
+    (
+        {**RECORDS["directional"], "irradiance": [1, 1, float("inf")]},
+        r"irradiance\[2\]: got inf, expected a finite number; mend it",
+    ),
+    ({**RECORDS["point"], "position": [0, float("nan"), 0]}, r"position\[1\]: got nan, expected a finite number; mend it"),
+    ({**RECORDS["point"], "position": [0, 0]}, r"position: got \[0, 0\], expected at least 3 entries; mend it"),
+    ({**RECORDS["point"], "position": [0, 0, 0, 0]}, r"position: got \[0, 0, 0, 0\], expected at most 3 entries; mend it"),
     ({**RECORDS["point"], "position": "here"}, "position: got 'here'"),
-    ({**RECORDS["directional"], "direction": [0, 0, 0]}, "direction: got a vector of length 0, expected a direction"),
+    (
+        {**RECORDS["directional"], "direction": [0, 0, 0]},
+        r"^lighting\[0\]\.direction: got a vector of length 0, .*; give it one",
+    ),
     ({**RECORDS["spot"], "direction": [0, 0, 0]}, "direction: got a vector of length 0, expected a direction"),
-    ({**RECORDS["spot"], "inner_deg": 40}, r"inner_deg: got 40.0, expected less than outer_deg \(35.0\)"),
+    (
+        {**RECORDS["spot"], "inner_deg": 40},
+        r"^lighting\[0\]\.inner_deg: got 40.0, expected less than outer_deg \(35.0\); lower it",
+    ),
     ({**RECORDS["spot"], "outer_deg": 91}, "outer_deg: got 91"),
     ({**RECORDS["rect"], "half_u": [0, 0, 0]}, "half_u: got a vector of length 0"),
-    ({**RECORDS["rect"], "half_u": [0, 0.2, 0.6]}, "got parallel vectors, expected a rectangle with area"),
+    (
+        {**RECORDS["rect"], "half_u": [0, 0.2, 0.6]},
+        r"\[0\]\.half_v: got a vector parallel to half_u, expected a rectangle with area; turn one",
+    ),
     ({**RECORDS["sphere"], "radius": 0}, "radius: got 0, .*greater than 0"),
     ({**RECORDS["sphere"], "radius": -1}, "radius: got -1"),
-    ("point", "got str, expected a light or a list of lights"),
+    ("point", "got str, expected a light or a list of lights; write"),
     (None, "got NoneType"),
     (7, "got int"),
-    ([], "got no light, expected at least one"),
+    ([], "got no light, expected at least one; write"),
     ((), "got no light, expected at least one"),
-    ([RECORDS["point"], 5], r"lighting\.1: got 5"),
+    ([RECORDS["point"], 5], r"lighting\[1\]: got 5, expected a light; write \[\{"),
     ([RECORDS["point"], {**RECORDS["point"], "type": "bulb"}], r"lighting\[1\]\.type"),
 ]
 
@@ -364,23 +385,24 @@ def test_bad_records_get_one_line(records: Any, message: str) -> None:
         parse_lighting(records)
     assert "\n" not in str(caught.value)
     assert str(caught.value).startswith("lighting")
+    assert "; " in str(caught.value), "what to do"
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (None, "got No such file or directory, expected a readable JSON list"),
-        ("", "not JSON"),
+        (None, "got No such file or directory, expected a readable JSON list of lightings; check the path"),
+        ("", "got text that is not JSON .*, expected a list of lightings; mend it"),
         ("[[{", "not JSON"),
         (b"\xff\xfe\x00", "not JSON"),
-        ("[]", "got an empty list, expected lightings"),
-        ("{}", "got dict, expected lightings"),
+        ("[]", r"got an empty list, expected a list of lightings; write \[\[\{"),
+        ("{}", "got dict, expected a list of lightings"),
         ('[[{"type": "lamp"}]]', r"lightings\.json\[0\]\[0\]\.type: got 'lamp'"),
         ("[[]]", r"json\[0\]: got no light, expected at least one"),
         (
             '[[{"type": "point", "position": [0, 0, 0], "intensity": [1, 1, 1]}],'
             ' [{"type": "point", "position": [0, 0, NaN], "intensity": [1, 1, 1]}]]',
-            r"json\[1\].*position\.2: got nan",
+            r"json\[1\]\[0\]\.position\[2\]: got nan",
         ),
     ],
 )
@@ -411,3 +433,35 @@ def test_directions_of_any_length_mean_the_same(length: float) -> None:
 def test_reading_a_direction_back_changes_nothing() -> None:
     light = parse_lighting({"type": "directional", "direction": [0.3, -2.1, 0.7], "irradiance": [1, 1, 1]})
     assert parse_lighting(lighting_json(light)) == light
+
+
+# --- doubts -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("height", "why"),
+    [
+        (0.0, "stands on a surface"),
+        (1e-30, "stands on a surface"),
+        (-1e-7, "stands on a surface"),  # nearer than a ray's origin is to its surface: neither side is known
+        (-1e-3, "stands inside a solid or behind a wall"),
+        (1e-3, ""),
+    ],
+)
+def test_a_lamp_on_a_floor_stands_in_no_solid(height: float, why: str) -> None:
+    scene = build("cornell")
+    low, high = scene.bounds
+    lamp = parse_lighting({**RECORDS["point"], "position": [*((low + high) / 2)[:1], low[1] + height, ((low + high) / 2)[2]]})
+    assert doubt(lamp, False, scene, Tracer.of(scene)) == why
+
+
+def test_a_reason_is_told_once() -> None:
+    reasons = {
+        "0 (train)": "has no intensity",
+        "1 (train)": "faces away",
+        "2 (test)": "has no intensity",
+        "3 (test)": "faces away",
+    }
+    assert grouped(reasons, 8) == "0 (train), 2 (test): has no intensity; 1 (train), 3 (test): faces away"
+    assert grouped(dict.fromkeys("abcd", "faces away"), 2) == "a, b and 2 more: faces away"
+    assert grouped({}, 2) == ""

@@ -252,7 +252,10 @@ PICTURE = Material("a", (0.5, 0.5, 0.5), np.ones((2, 2, 3)))
             {"positions": np.where(np.arange(4)[:, None] >= 2, np.nan, SQUARE)},
             "2 vertices whose position is not finite.* index 2",
         ),
-        ({"positions": SQUARE * 1e200}, "not finite"),
+        (
+            {"positions": SQUARE * 1e200},
+            "3 vertices whose position is too large, .*expected numbers below 1e.15; correct the unit",
+        ),
         ({"positions": SQUARE * [1, 0, 0]}, "only triangles of no area"),
         ({"positions": SQUARE * 1e-200}, "only triangles of no area"),
         ({"materials": (Material("paint", (0.5, np.nan, 0.5)),)}, 'material "paint"'),
@@ -290,7 +293,11 @@ LOW, LOST = np.vstack([SQUARE, [0.5, 1e-10, 0]]), np.vstack([SQUARE, [[np.nan] *
             2,
         ),
         ({"triangles": np.array([[0, 1, 2], [0, 2, 3], [1, 2, 0]])}, ["1 repeated triangles removed$"], 2),
-        ({"triangles": np.array([[0, 1, 2], [0, 2, 3], [3, 2, 0], [1, 0, 2]])}, ["2 repeated .*2 of them the back"], 2),
+        (
+            {"triangles": np.array([[0, 1, 2], [0, 2, 3], [3, 2, 0], [1, 0, 2]])},
+            [r"2 repeated triangles removed, 2 of them the back of another: the side facing \(0, 0, 1\) is lit; give"],
+            2,
+        ),
         (
             {"triangles": np.array([[0, 1, 2], [2, 0, 3], [3, 2, 0]])},
             ["1 repeated triangles removed$", "1 triangles turned"],
@@ -317,6 +324,23 @@ def test_what_can_be_mended_is_noted(arguments: dict, notes: list[str], count: i
     np.testing.assert_allclose(scene.geometric_normals, [[0, 0, 1]] * count, atol=1e-9)
     if "point behind" not in "".join(scene.notes):
         np.testing.assert_allclose(scene.normals, UP, atol=1e-9)
+
+
+def test_a_sheet_names_the_side_that_is_lit_after_turning() -> None:
+    """One triangle of each side stands first: the second is turned to the first's side, and that one is named."""
+    for up, facing in ((True, "(0, 0, 1)"), (False, "(0, 0, -1)")):
+        sides = np.array([[0, 1, 2], [3, 2, 0], [2, 1, 0], [0, 2, 3]])
+        scene = checked("sheet", SQUARE, sides if up else sides[:, ::-1])
+        assert f"2 of them the back of another: the side facing {facing} is lit" in scene.notes[0]
+        assert scene.notes[1].startswith("1 triangles turned")
+        np.testing.assert_allclose(scene.geometric_normals[:, 2], 1 if up else -1, atol=1e-9)
+
+
+def test_where_sheets_face_many_ways_the_file_decides() -> None:
+    points, ball = icosphere(2)
+    scene = checked("ball", points, np.concatenate([ball, ball[:, ::-1]]))
+    assert "the side that comes first in the file is lit" in scene.notes[0]
+    assert solid_angle(scene, np.zeros(3)) == pytest.approx(1)
 
 
 def test_repeats_keep_the_first_and_its_material() -> None:

@@ -3,6 +3,7 @@
 import base64
 import io
 import json
+import re
 import struct
 from pathlib import Path
 
@@ -252,8 +253,8 @@ def spoil(writer: Writer, **entries: object) -> Writer:
         (lambda: spoil(one(), extensionsRequired=["XYZ_unheard_of"]), "required extension XYZ_unheard_of"),
         (lambda: one(mode=5), "triangle strip or fan"),
         (lambda: one(mode=1), "no triangles"),
-        (lambda: spoil(one(), meshes=[]), "damaged"),
-        (lambda: spoil(one(), scenes=[{"nodes": [7]}]), "damaged"),
+        (lambda: spoil(one(), meshes=[]), "number 0 among meshes, expected one of the 0 there are; export it again"),
+        (lambda: spoil(one(), scenes=[{"nodes": [7]}]), "number 7 among nodes, expected one of the 1 there are"),
         (lambda: spoil(one(), nodes=[{"children": [0], "mesh": 0}]), "twice in the hierarchy"),
         (
             lambda: spoil(one(), accessors=[{"componentType": 5126, "count": 3, "type": "VEC3", "sparse": {"count": 1}}] * 3),
@@ -262,8 +263,13 @@ def spoil(writer: Writer, **entries: object) -> Writer:
         (lambda: spoil(one(), accessors=[{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC2"}] * 3), "VEC2"),
         (
             lambda: spoil(one(), accessors=[{"bufferView": 0, "componentType": 5126, "count": 9**9, "type": "VEC3"}] * 3),
-            "damaged",
+            r"got 36 bytes for accessor 0, expected 4649045868; it is damaged",  # 12 * 9**9
         ),
+        (
+            lambda: spoil(one(), accessors=[{"bufferView": 0, "componentType": 9999, "count": 3, "type": "VEC3"}] * 3),
+            "component type 9999, expected one of 5120, 5121",
+        ),
+        (lambda: spoil(one(), nodes=[{"mesh": "a"}]), "got a damaged file, expected glTF 2.0, whole JSON .*; export it again"),
         (lambda: spoil(one(), bufferViews=[{"buffer": 0, "byteOffset": 0, "byteLength": 10**6}] * 3), "cut short"),
         (lambda: spoil(textured(), images=[{"uri": "nowhere.png"}]), 'no "nowhere.png" beside it'),
         (lambda: spoil(textured(), images=[{"uri": "data:image/png;base64,AAAA"}]), "image 0 that cannot be read"),
@@ -276,6 +282,24 @@ def test_refused_gltf(tmp_path: Path, writer: object, says: str) -> None:
         load_scene(writer().gltf(tmp_path / "bad.gltf"))  # type: ignore[operator]
     assert str(caught.value).startswith("bad")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("corner", "count"), [("0", 1), ("9", 1), ("-9/1", 1), ("0//1", 1), ("9 9", 2)])
+def test_an_obj_says_which_vertices_there_are(tmp_path: Path, corner: str, count: int) -> None:
+    """trimesh would take 0 for the last vertex, without a word."""
+    vertices = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 1) for z in (0, 1))
+    (tmp_path / "box.obj").write_text(f"{vertices}f 1 2 3 # 99\nf 2 3 4\nf 5 6 {corner} 7\n")
+    with pytest.raises(UserError) as caught:
+        load_scene(tmp_path / "box.obj")
+    wrong = corner.split("/")[0].split()[0]
+    assert str(caught.value) == (
+        f"box.obj: got a face with vertex {wrong} ({count} out of range), expected vertex indices from 1 to 8; export it again"
+    )
+
+
+def test_an_obj_may_count_from_the_end(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3//-1  -2 -1\n")
+    assert len(load_scene(tmp_path / "a.obj").triangles) == 1
 
 
 def test_missing_buffer_file(tmp_path: Path) -> None:
@@ -470,6 +494,7 @@ def test_cut_files_raise_nothing_but_user_errors(tmp_path: Path, kind: str) -> N
         path.write_bytes(whole[:cut])
         said = complaint(path)
         refused += bool(said)
+        assert kind not in ("glb", "gltf") or not re.search(r"Error|Exception", said), said
         assert "\n" not in said
     # A text file that ends early after a whole line may still be a mesh.
     assert refused == len(cuts) if kind in ("glb", "gltf", "ply", "stl") else refused > 5

@@ -8,6 +8,7 @@ from ddprt.config import LightingsConfig
 from ddprt.errors import UserError
 from ddprt.lights import Lighting, lighting_json, load_lightings, parse_lighting
 from ddprt.sampling.lightings import draw_lightings
+from ddprt.scene.distance import distance_within
 from ddprt.scene.mesh import Scene
 from ddprt.transport.embree import Tracer
 
@@ -67,12 +68,29 @@ def doubt(lighting: Lighting, lights_nothing: bool, scene: Scene, tracer: Tracer
     if not any(strengths):
         return prefix + "has no intensity"
     if all_placed and not (tracer.clearance(np.array(places)) > 0).any():
-        return prefix + "stands inside a solid or behind a wall"
+        boxes = np.stack([scene.corners.min(1), scene.corners.max(1)], 1)
+        touching = any(distance_within(scene.corners, boxes, place, float(tracer.offset)) < tracer.offset for place in places)
+        return prefix + ("stands on a surface" if touching else "stands inside a solid or behind a wall")
     if not lights_nothing:
         return ""
     low, high = scene.bounds
     outside = all_placed and all(((place < low) | (place > high)).any() for place in places)
     return prefix + ("stands outside the scene" if outside else "faces away or is shadowed")
+
+
+def grouped(reasons: Mapping[str, str], most: int) -> str:
+    """Doubtful lightings in one line, those of one reason together.
+
+    Args:
+      reasons: why each is doubtful, by name: `{"3 (train)": "has no intensity"}`.
+      most: names that are spelt out for each reason.
+    """
+    told = []
+    for why in dict.fromkeys(reasons.values()):
+        names = [name for name, reason in reasons.items() if reason == why]
+        more = f" and {len(names) - most} more" if len(names) > most else ""
+        told.append(f"{', '.join(names[:most])}{more}: {why}")
+    return "; ".join(told)
 
 
 def _listed(config: LightingsConfig) -> Splits:

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from pydantic import Field, TypeAdapter, ValidationError
 
 from ddprt.catalogue import Catalogue
-from ddprt.errors import UserError, nearest
+from ddprt.errors import UserError, explain, nearest, spoken
 from ddprt.lights.area import RectLight, SphereLight
 from ddprt.lights.distant import DirectionalLight
 from ddprt.lights.light import Light
@@ -24,6 +24,7 @@ LIGHTS: Catalogue[type] = Catalogue(
 Lighting = tuple[Light, ...]
 """Lights that are on together."""
 
+_EXAMPLE = '[{"type": "point", "position": [0, 1, 0], "intensity": [1, 1, 1]}]'
 _ADAPTER: TypeAdapter[Any] = TypeAdapter(
     tuple[Annotated[PointLight | SpotLight | DirectionalLight | RectLight | SphereLight, Field(discriminator="type")], ...]
 )
@@ -41,22 +42,39 @@ def parse_lighting(records: Any, where: str = "lighting") -> Lighting:
     if isinstance(records, (dict, *LIGHTS.values())):
         records = [records]
     if not isinstance(records, list | tuple):
-        raise UserError(f"{where}: got {type(records).__name__}, expected a light or a list of lights")
+        raise UserError(
+            f"{where}: got {type(records).__name__}, expected a light or a list of lights; write {_EXAMPLE} or the like"
+        )
     if len(records) == 0:
-        raise UserError(f"{where}: got no light, expected at least one")
+        raise UserError(f"{where}: got no light, expected at least one; write {_EXAMPLE} or the like")
     for index, record in enumerate(records):
-        if isinstance(record, dict) and record.get("type") not in list(LIGHTS):
-            hint = nearest(str(record.get("type")), LIGHTS)
-            raise UserError(
-                f"{where}[{index}].type: got {record.get('type')!r}, expected one of {', '.join(sorted(LIGHTS))}{hint}"
-            )
+        if isinstance(record, tuple(LIGHTS.values())):
+            continue
+        if not isinstance(record, dict):
+            raise UserError(f"{where}[{index}]: got {record!r}, expected a light; write {_EXAMPLE} or the like")
+        kind = record.get("type")
+        if kind not in list(LIGHTS):
+            hint = nearest(str(kind), LIGHTS) or "; choose one"
+            raise UserError(f"{where}[{index}].type: got {kind!r}, expected one of {', '.join(sorted(LIGHTS))}{hint}")
     try:
         return tuple(_ADAPTER.validate_python(tuple(records)))
     except ValidationError as error:
-        fault = error.errors()[0]
-        place = ".".join(str(part) for part in fault["loc"] if part not in LIGHTS)
-        got = "" if fault["type"] in ("missing", "value_error") else f" got {fault['input']!r},"
-        raise UserError(f"{where}.{place}:{got} {fault['msg'].removeprefix('Value error, ')}") from None
+        raise UserError(_fault(error.errors()[0], where)) from None
+
+
+def _fault(fault: Any, where: str) -> str:
+    """A fault of pydantic in one line, as those of the configuration are told."""
+    index, kind, *inner = fault["loc"]
+    key, text = spoken(fault)
+    short = fault["type"] == "missing" and isinstance(inner[-1], int)  # of an entry: told with the list that lacks it
+    parts = [*inner[: len(inner) - short], *([key] if key else [])]
+    place = f"{where}[{index}]" + "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in parts)
+    known = ", ".join(LIGHTS[kind].model_fields)  # type: ignore[attr-defined]
+    if fault["type"] == "extra_forbidden":
+        return f"{place}: unknown key{nearest(inner[-1], LIGHTS[kind].model_fields)}; known here: {known}"  # type: ignore[attr-defined]
+    if fault["type"] == "missing" and not short:
+        return f"{place}: got none, expected it among {known}; add it"
+    return f"{place}: {text or explain([fault], [0, 1, 0])}"
 
 
 def load_lightings(path: str | Path) -> list[Lighting]:
@@ -68,11 +86,13 @@ def load_lightings(path: str | Path) -> list[Lighting]:
     try:
         document = json.loads(Path(path).read_text("utf-8"))
     except OSError as error:
-        raise UserError(f"{path}: got {error.strerror or error}, expected a readable JSON list of lightings") from None
+        why = error.strerror or error
+        raise UserError(f"{path}: got {why}, expected a readable JSON list of lightings; check the path") from None
     except (ValueError, RecursionError) as error:
-        raise UserError(f"{path}: not JSON: {error}") from None
+        raise UserError(f"{path}: got text that is not JSON ({error}), expected a list of lightings; mend it") from None
     if not isinstance(document, list) or not document:
-        raise UserError(f"{path}: got {'an empty list' if document == [] else type(document).__name__}, expected lightings")
+        got = "an empty list" if document == [] else type(document).__name__
+        raise UserError(f"{path}: got {got}, expected a list of lightings; write [{_EXAMPLE}] or the like")
     return [parse_lighting(entry, f"{path}[{index}]") for index, entry in enumerate(document)]
 
 

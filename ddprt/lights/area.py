@@ -27,7 +27,7 @@ class RectLight(LightModel):
     @model_validator(mode="after")
     def _has_area(self) -> "RectLight":
         if not np.cross(self.half_u, self.half_v).any():
-            raise ValueError("half_u and half_v: got parallel vectors, expected a rectangle with area")
+            raise ValueError("half_v: got a vector parallel to half_u, expected a rectangle with area; turn one of them")
         return self
 
     def illuminate(

@@ -22,7 +22,7 @@ Colour = tuple[Strength, Strength, Strength]
 
 def _not_zero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
     if not any(vector):
-        raise ValueError("got a vector of length 0, expected a direction")
+        raise ValueError("got a vector of length 0, expected a direction; give it one")
     return vector
 
 

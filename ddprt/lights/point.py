@@ -56,7 +56,7 @@ class SpotLight(LightModel):
     @model_validator(mode="after")
     def _cone_opens(self) -> "SpotLight":
         if self.inner_deg >= self.outer_deg:
-            raise ValueError(f"inner_deg: got {self.inner_deg}, expected less than outer_deg ({self.outer_deg})")
+            raise ValueError(f"inner_deg: got {self.inner_deg}, expected less than outer_deg ({self.outer_deg}); lower it")
         return self
 
     def illuminate(

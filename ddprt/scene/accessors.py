@@ -34,6 +34,13 @@ class Container:
         """The error to raise, with the file's name in front."""
         return UserError(f"{self.path.name}: {message}")
 
+    def entry(self, kind: str, number: int) -> Any:
+        """An entry of one of the file's lists, such as "accessors"."""
+        entries = getattr(self.json, kind) or []
+        if not 0 <= number < len(entries):
+            raise self.fault(f"got number {number} among {kind}, expected one of the {len(entries)} there are; export it again")
+        return entries[number]
+
     def accessor(self, number: int, width: int) -> Float64[np.ndarray, "count width"]:
         """Rows of an accessor: strides are followed, normalised integers become -1 to 1, other integers stay exact.
 
@@ -41,22 +48,31 @@ class Container:
           number: of the accessor.
           width: numbers per row that its type must have.
         """
-        accessor = self.json.accessors[number]
+        accessor = self.entry("accessors", number)
         if accessor.sparse is not None or accessor.bufferView is None:
             raise self.fault("got a sparse accessor, which is not read; export without sparse accessors")
         if _WIDTHS.get(accessor.type) != width:
             raise self.fault(f"got accessor {number} of {accessor.type}, expected {width} numbers; export it again")
+        if accessor.componentType not in _TYPES:
+            known = ", ".join(map(str, _TYPES))
+            raise self.fault(
+                f"got accessor {number} of component type {accessor.componentType}, expected one of {known}; export it again"
+            )
         kind = np.dtype(_TYPES[accessor.componentType])
-        step = self.json.bufferViews[accessor.bufferView].byteStride or kind.itemsize * width
-        shape, strides = (accessor.count, width), (step, kind.itemsize)
-        rows = np.ndarray(shape, kind, self.view(accessor.bufferView), accessor.byteOffset or 0, strides)
+        step = self.entry("bufferViews", accessor.bufferView).byteStride or kind.itemsize * width
+        shape, strides, start = (accessor.count, width), (step, kind.itemsize), accessor.byteOffset or 0
+        data = self.view(accessor.bufferView)
+        end = start + (accessor.count - 1) * step + width * kind.itemsize if accessor.count else start
+        if not 0 <= start <= end <= len(data):
+            raise self.fault(f"got {len(data)} bytes for accessor {number}, expected {end}; it is damaged: export it again")
+        rows = np.ndarray(shape, kind, data, start, strides)
         if accessor.normalized:
             return np.maximum(rows / float(np.iinfo(kind).max), -1.0)
         return rows.astype(np.float64)
 
     def view(self, number: int) -> memoryview:
         """The bytes of a buffer view."""
-        view = self.json.bufferViews[number]
+        view = self.entry("bufferViews", number)
         buffer, start = self._buffer(view.buffer), view.byteOffset or 0
         end = start + view.byteLength
         if not 0 <= start <= end <= len(buffer):
@@ -74,7 +90,7 @@ class Container:
 
     def _buffer(self, number: int) -> bytes:
         if number not in self._buffers:
-            uri = self.json.buffers[number].uri
+            uri = self.entry("buffers", number).uri
             data = self.json.binary_blob() if uri is None else self.uri(uri)
             if data is None:
                 raise self.fault(f"got no data for buffer {number}, expected some; it is cut short: copy it again")

@@ -72,10 +72,7 @@ def checked(
     keep = ~_negligible(positions[triangles])
     if removed := np.count_nonzero(~keep):
         found.append(f"{removed} triangles of no area removed")
-    repeated, opposed = repeats(weld[triangles], keep)
-    if repeated.any():
-        back = f", {opposed} of them the back of another: give a sheet thickness if both sides reflect" if opposed else ""
-        found.append(f"{np.count_nonzero(repeated)} repeated triangles removed{back}")
+    repeated, backed = repeats(weld[triangles], keep)
     keep &= ~repeated
     if not keep.any():
         raise UserError(
@@ -84,6 +81,10 @@ def checked(
     triangles, material = triangles[keep], material[keep]
 
     turned, twisted = winding(weld[triangles], _areas(positions[triangles]))
+    if repeated.any():
+        backed = (np.cumsum(keep) - 1)[backed]
+        back = _sheets(positions[triangles[backed]], turned[backed]) if len(backed) else ""
+        found.append(f"{np.count_nonzero(repeated)} repeated triangles removed{back}")
     if turned.any():
         found.append(f"{np.count_nonzero(turned)} triangles turned to face as the rest of their surface")
         triangles[turned] = triangles[turned, ::-1]
@@ -155,9 +156,11 @@ def _finite(name: str, what: str, rows: np.ndarray, triangles: np.ndarray) -> No
     bad = ~(np.abs(rows) < FARTHEST).all(axis=1)
     at_fault = np.unique(triangles[bad[triangles]])
     if len(at_fault):
+        far = np.isfinite(rows[at_fault]).all()
+        wrong, expected = ("too large", f"numbers below {FARTHEST:g}") if far else ("not finite", "numbers")
         raise UserError(
-            f"{name}: got {len(at_fault)} vertices whose {what} is not finite, the first at index {at_fault[0]},"
-            " expected numbers; remove them and export again"
+            f"{name}: got {len(at_fault)} vertices whose {what} is {wrong}, the first at index {at_fault[0]},"
+            f" expected {expected}; {'correct the unit' if far else 'remove them'} and export again"
         )
 
 
@@ -177,6 +180,16 @@ def _reflects(name: str, material: Material, uv: np.ndarray | None) -> None:
         raise UserError(
             f'{name}: got a texture of material "{material.name}" but no texture coordinates; unwrap it or drop the texture'
         )
+
+
+def _sheets(corners: np.ndarray, turned: np.ndarray) -> str:
+    """What became of triangles that lay back to back with others, and which of the two sides is lit now."""
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) * np.where(turned, -1.0, 1.0)[:, None]
+    total, area = cross.sum(axis=0), np.linalg.norm(cross, axis=1).sum()
+    x, y, z = np.round(total / area, 2) + 0.0
+    one_way = np.linalg.norm(total) > 0.99 * area
+    side = f"facing ({x:g}, {y:g}, {z:g})" if one_way else "that comes first in the file"
+    return f", {len(corners)} of them the back of another: the side {side} is lit; give a sheet thickness if both sides reflect"
 
 
 def _areas(corners: np.ndarray) -> np.ndarray:

@@ -7,7 +7,16 @@ from ddprt.errors import UserError, nearest
 from ddprt.scene.library import SCENES, build
 from ddprt.scene.mesh import Scene
 
-SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
+EXPECTED = {
+    ".glb": "binary glTF 2.0, a JSON chunk and its buffer",
+    ".gltf": "glTF 2.0, whole JSON with asset, meshes and accessors",
+    ".obj": "OBJ, lines of v x y z and f with three or more vertices",
+    ".ply": "PLY, vertices with x, y and z and faces with vertex_indices",
+    ".stl": "STL, as many triangles as its head says",
+}
+"""What is read, by suffix, and what a whole file has."""
+
+SUFFIXES = tuple(EXPECTED)
 
 
 def load_scene(source: str | Path, **parameters: float | int) -> Scene:
@@ -40,6 +49,18 @@ def load_scene(source: str | Path, **parameters: float | int) -> Scene:
         raise UserError(f"{path}: got no such file, expected a mesh; check the path")
     if parameters:
         raise UserError(f"{path.name}: got parameter {next(iter(parameters))}, expected none for a file; leave it out")
+    try:
+        return _read(path, suffix)
+    except UserError:
+        raise
+    except Exception as problem:  # what a reader's library says of its own insides helps nobody to export again
+        raise UserError(
+            f"{path.name}: got a damaged file, expected {EXPECTED[suffix]}; export it again, or run with --debug to see "
+            "where reading stopped"
+        ) from problem
+
+
+def _read(path: Path, suffix: str) -> Scene:
     # Each reader brings its own library, which a scene in code should not wait for.
     if suffix in (".glb", ".gltf"):
         from ddprt.scene.gltf import load_gltf
@@ -47,4 +68,19 @@ def load_scene(source: str | Path, **parameters: float | int) -> Scene:
         return load_gltf(path)
     from ddprt.scene.polygons import load_polygons
 
+    if suffix == ".obj":
+        _check_corners(path)
     return load_polygons(path)
+
+
+def _check_corners(path: Path) -> None:
+    """Makes sure that the faces of an OBJ name vertices that there are; trimesh would take 0 for the last one."""
+    data = path.read_bytes()
+    count = len(re.findall(rb"^[ \t]*v[ \t]", data, re.MULTILINE))
+    faces = b"\n".join(re.findall(rb"^[ \t]*f([ \t][^#\r\n]*)", data, re.MULTILINE))
+    wrong = [index for index in map(int, re.findall(rb"(?<=\s)-?\d+", faces)) if not 0 < abs(index) <= count]
+    if wrong:
+        raise UserError(
+            f"{path.name}: got a face with vertex {wrong[0]} ({len(wrong)} out of range), expected vertex indices from 1 to "
+            f"{count}; export it again"
+        )

@@ -14,7 +14,6 @@ import pygltflib
 from scipy.spatial.transform import Rotation
 
 from ddprt.axes import Float, Float64, Int
-from ddprt.errors import UserError
 from ddprt.scene.accessors import Container, open_gltf
 from ddprt.scene.checks import UNSAID, checked
 from ddprt.scene.images import linear_image
@@ -42,19 +41,14 @@ def load_gltf(path: Path) -> Scene:
     Returns:
       The scene: metres, fronts as in the file (mirrored nodes keep theirs), one material per glTF material.
     Raises:
-      UserError: damaged or cut short, not glTF 2.0, compressed geometry, sparse accessors, strips or fans.
+      UserError: cut short, an index out of range, compressed geometry, sparse accessors, strips or fans. What else a damaged
+        file leads to is raised as it comes; `load_scene` puts it into words.
     Reference: Khronos glTF 2.0 specification; KHR_mesh_quantization, KHR_texture_transform.
     """
-    try:
-        with warnings.catch_warnings():
-            # pygltflib speaks by warnings; what matters in them is found and refused below.
-            warnings.simplefilter("ignore")
-            return _Reader(open_gltf(path)).scene()
-    except UserError:
-        raise
-    except Exception as problem:
-        reason = f"{type(problem).__name__}: {problem}".splitlines()[0]
-        raise UserError(f"{path.name}: got a damaged file ({reason}), expected glTF 2.0; export it again") from problem
+    with warnings.catch_warnings():
+        # pygltflib speaks by warnings; what matters in them is found and refused below.
+        warnings.simplefilter("ignore")
+        return _Reader(open_gltf(path)).scene()
 
 
 @dataclass
@@ -111,14 +105,18 @@ class _Reader:
         """Meshes with their transforms to the world, in the order of the hierarchy."""
         nodes, scenes = self.file.json.nodes, self.file.json.scenes
         children = {child for node in nodes for child in node.children or []}
-        roots = scenes[self.file.json.scene or 0].nodes if scenes else [n for n in range(len(nodes)) if n not in children]
+        roots = (
+            self.file.entry("scenes", self.file.json.scene or 0).nodes
+            if scenes
+            else [n for n in range(len(nodes)) if n not in children]
+        )
         placed, seen, waiting = [], set(), [(root, np.eye(4)) for root in reversed(roots)]
         while waiting:
             number, parent = waiting.pop()
-            if number in seen or number < 0:
+            if number in seen:
                 raise self.file.fault(f"got node {number} twice in the hierarchy, expected a tree; export it again")
             seen.add(number)
-            node = nodes[number]
+            node = self.file.entry("nodes", number)
             world = parent @ _transform(node)
             if node.mesh is not None:
                 placed.append((node.mesh, world))
@@ -127,7 +125,7 @@ class _Reader:
 
     def _parts(self, mesh: int, world: Float64[np.ndarray, "4 4"]) -> list[_Part]:
         parts = []
-        for primitive in self.file.json.meshes[mesh].primitives:
+        for primitive in self.file.entry("meshes", mesh).primitives:
             mode = 4 if primitive.mode is None else primitive.mode
             if mode in (0, 1, 2, 3):
                 self.ignored.add("points and lines")
@@ -175,7 +173,9 @@ class _Reader:
         )
 
     def _coordinates(self, primitive: Any, count: int) -> Float[np.ndarray, "vertices 2"]:
-        texture = None if primitive.material is None else _base(self.file.json.materials[primitive.material]).baseColorTexture
+        texture = (
+            None if primitive.material is None else _base(self.file.entry("materials", primitive.material)).baseColorTexture
+        )
         if texture is None:
             return np.zeros((count, 2))
         change = (texture.extensions or {}).get("KHR_texture_transform", {})
@@ -194,7 +194,7 @@ class _Reader:
         if number < 0:
             self.notes.append(f"no material on some triangles: albedo {UNSAID} assumed")
             return Material("none", (UNSAID,) * 3)
-        entry = self.file.json.materials[number]
+        entry = self.file.entry("materials", number)
         base = _base(entry)
         self.ignored.update(
             what
@@ -213,18 +213,18 @@ class _Reader:
         return Material(entry.name or f"material {number}", (red, green, blue), texture)
 
     def _image(self, number: int) -> np.ndarray:
-        texture = self.file.json.textures[number]
+        texture = self.file.entry("textures", number)
         webp = (texture.extensions or {}).get("EXT_texture_webp", {}).get("source")
         source = webp if webp is not None else texture.source
         if source is None:
             raise self.file.fault(f"got texture {number} without an image, expected PNG or JPEG; export textures as PNG")
         if texture.sampler is not None:
-            sampler = self.file.json.samplers[texture.sampler]
+            sampler = self.file.entry("samplers", texture.sampler)
             if {sampler.wrapS, sampler.wrapT} - {None, 10497}:
                 self.ignored.add("texture wrap modes other than repeat")
         if source in self.images:
             return self.images[source]
-        image = self.file.json.images[source]
+        image = self.file.entry("images", source)
         try:
             self.images[source] = linear_image(
                 bytes(self.file.view(image.bufferView)) if image.uri is None else self.file.uri(image.uri)

@@ -21,14 +21,14 @@ def welded(positions: Float[np.ndarray, "vertices 3"]) -> Int[np.ndarray, " vert
 
 def repeats(
     corners: Int[np.ndarray, "triangles 3"], keep: Bool[np.ndarray, " triangles"]
-) -> tuple[Bool[np.ndarray, " triangles"], int]:
+) -> tuple[Bool[np.ndarray, " triangles"], Int[np.ndarray, " opposed"]]:
     """Triangles that repeat an earlier one.
 
     Args:
       corners: place of each corner.
       keep: which triangles count at all.
     Returns:
-      Mask of those whose three places an earlier triangle has, and how many of them face the other way.
+      Mask of those whose three places an earlier triangle has, and for each of them that faces the other way that earlier one.
     """
     rank = np.argsort(corners, axis=1)
     odd = (rank[:, 0] - rank[:, 1]) % 3 == 1
@@ -39,7 +39,7 @@ def repeats(
     first = order[np.searchsorted(group, group)]
     repeated = np.zeros(len(corners), bool)
     repeated[order] = first != order
-    return repeated, int(np.count_nonzero(odd[first] != odd[order]))
+    return repeated, first[odd[first] != odd[order]]
 
 
 def winding(
