@@ -19,7 +19,7 @@ from ddprt.dataset import store
 from ddprt.dataset.denoise import find_denoiser
 from ddprt.dataset.indirect import IndirectBake
 from ddprt.dataset.scratch import remove_left
-from ddprt.dataset.splits import SPLITS, Splits, choose_lightings, doubt
+from ddprt.dataset.splits import SPLITS, Splits, choose_lightings, doubt, grouped
 from ddprt.dataset.store import Dataset, Manifest, map_name
 from ddprt.errors import UserError
 from ddprt.files import alone_in, write_tensors
@@ -198,7 +198,7 @@ class _Bake:
         with self.progress.stage("atlas") as stage:
             settings = self.config.atlas
             atlas, hidden = build_open_atlas(self.tracer, self.scene, settings.resolution, settings.padding)
-            stage.facts |= {"texels": atlas.count, "texels_per_metre": round(atlas.texels_per_metre, 3), **hidden}
+            stage.facts |= {"texels": atlas.count, "texels_per_metre": float(f"{atlas.texels_per_metre:.4g}"), **hidden}
         with self.progress.stage("points") as stage:
             samples = listed or self._sunk(self._placed(atlas), lightings)
             stage.facts |= {"samples": len(samples.position), "depth": round(samples.depth, 6)}
@@ -348,7 +348,7 @@ class _Bake:
 
     def _judge_lightings(self, dataset: Dataset, fresh: bool) -> None:
         """Names lightings that light nothing or stand where no lamp should, and why; refuses a bake of darkness."""
-        faults, dark = [], 0
+        dark, faults = 0, dict[str, str]()
 
         def is_black(index: int) -> bool:
             return not store.read_map(self.folder / map_name("direct", index)).any()
@@ -358,14 +358,13 @@ class _Bake:
             dark += black
             why = doubt(lighting, black, self.scene, self.tracer)
             if why:
-                faults.append(f"{index} ({dataset.description['lightings'][index]['split']}): {why}")
+                faults[f"{index} ({dataset.description['lightings'][index]['split']})"] = why
         if dark == len(dataset.lightings):
             if fresh:  # nothing in it is worth keeping, and it would be in the way of the next try
                 store.discard(self.folder)
             raise UserError(
-                f"lightings: all {dark} light nothing, expected light on the scene; the first: {faults[0]}; "
+                f"lightings: all {dark} light nothing, expected light on the scene; {grouped(faults, 1)}; "
                 "check positions, directions and intensities"
             )
         if faults:
-            more = f"; and {len(faults) - _NAMED} more" if len(faults) > _NAMED else ""
-            self.progress.warn(f"{len(faults)} doubtful lightings: {'; '.join(faults[:_NAMED])}{more}")
+            self.progress.warn(f"{len(faults)} doubtful lightings: {grouped(faults, _NAMED)}")

@@ -30,19 +30,14 @@ def load_polygons(path: Path) -> Scene:
     Returns:
       The scene; its notes say what was assumed and which files are missing.
     Raises:
-      UserError: damaged, cut short, or without triangles.
+      UserError: without triangles, or a corner that is no vertex. What else a damaged file leads to is raised as it comes;
+        `load_scene` puts it into words.
     """
     kind = path.suffix.lower()[1:]
-    try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
-            parts = [_part(name, mesh, kind) for name, mesh in _parsed(path, kind).items() if mesh.get("faces") is not None]
-            notes = _absent(path, kind)
-    except Exception as problem:
-        if isinstance(problem, ModuleNotFoundError):  # trimesh guessing at the encoding of what should have been binary
-            problem = ValueError("neither its binary nor its text form")
-        reason = " ".join(f"{type(problem).__name__}: {problem}".split())[:200]
-        raise UserError(f"{path.name}: got a damaged file ({reason}), expected {kind.upper()}; export it again") from problem
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        parts = [_part(name, mesh, kind) for name, mesh in _parsed(path, kind).items() if mesh.get("faces") is not None]
+        notes = _absent(path, kind)
     if not parts:
         raise UserError(f"{path.name}: got no triangles, expected a mesh; the file may be cut short")
     number: dict[str, int] = {}
@@ -106,7 +101,9 @@ def _part(name: str, mesh: dict[str, Any], kind: str) -> _Part:
     if faces.shape[1] == 4:
         faces, owner = np.concatenate([faces[:, [0, 1, 2]], faces[:, [0, 2, 3]]]), np.tile(owner, 2)
     if faces.size and not 0 <= faces.min() <= faces.max() < len(positions):
-        raise IndexError(f"a corner beyond the {len(positions)} vertices")
+        beyond = faces[(faces < 0) | (faces >= len(positions))][0]
+        expected = f"vertex indices from 0 to {len(positions) - 1}"
+        raise UserError(f"{name}: got a face with vertex {beyond}, expected {expected}; export it again")
     given, visual = mesh.get("vertex_normals"), mesh.get("visual")
     normals = np.full(positions.shape, np.nan) if given is None else np.asarray(given, dtype=np.float64)
     uv = getattr(visual, "uv", None)
