@@ -1,5 +1,9 @@
 """No negative light: the clamp that keeps energy against a float64 twin and its laws, and the ends of the number range."""
 
+import inspect
+from dataclasses import replace
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -46,14 +50,16 @@ def by_sorting(light: np.ndarray, area: np.ndarray) -> tuple[np.ndarray, float]:
 def rounding(light: np.ndarray, area: np.ndarray) -> tuple[float, float]:
     """Allowed error of a map's energy, and of `payers * level`, both as shares of energy.
 
-    Each sum over n places is off by at most (n + 3) u of its own size: a share, a product and n - 1 additions at u = EPS / 2,
-    and one more for the sum that shares were divided by. The level solves payers * level = debt - paid, of which none is
-    larger than the debt, so all together are off by 3 (n + 3) u debt and a division and a subtraction. Energy meets those once
-    more when it is counted with the exact shares, and every place rounds when the level is taken from it.
+    Each sum over n places is off by at most (h + 3) u of its own size, u = EPS / 2: a share that was divided twice, a product
+    and h additions, as n is halved h times. What shares add up to is no matter, for all sums have it as a factor. The level
+    solves payers * level = debt - paid, of which none is larger than the debt, so all together are off by 3 (h + 3) u debt and
+    a division and a subtraction. Energy meets those once more when it is counted with the exact shares, and every place
+    rounds when the level is taken from it.
     """
+    halvings = np.ceil(np.log2(len(light)))
     share = area.astype(np.float64) / area.astype(np.float64).sum()
     debt, positive = share @ np.maximum(-light.astype(np.float64), 0), share @ np.maximum(light.astype(np.float64), 0)
-    off = 2 * (len(light) + 5) * EPS * debt
+    off = 2 * (halvings + 5) * EPS * debt
     return off + EPS * min(positive, 2 * debt + positive), off
 
 
@@ -155,6 +161,22 @@ def test_many_steps_are_taken_where_they_are_needed() -> None:
     assert (got[3:] == 0).all()
 
 
+@pytest.mark.parametrize(("negative", "every"), [(-0.1, 10), (-0.9, 2)])
+def test_a_million_texels_keep_their_energy(negative: float, every: int) -> None:
+    """Equal values, where one addition after another is off in the same direction each time."""
+    light = np.where(np.arange(1_000_000) % every == 0, np.float32(negative), np.float32(1))
+    got, area = clamped(light, np.ones(len(light))), np.ones(len(light), np.float32)
+    assert abs((got.astype(np.float64) - light).mean()) <= rounding(light, area)[0]
+
+
+@pytest.mark.parametrize("unit", [1e-30, 1e30, 3e38])
+def test_areas_may_be_in_any_unit(unit: float) -> None:
+    light, area = np.array([3.0, 1.0, -0.5, 0.2]), np.array([0.25, 0.5, 1.0, 0.75])
+    got, expected = clamped(light, unit * area), by_sorting(light, area)[0]
+    # Areas round once more when they are taken times the unit.
+    np.testing.assert_allclose(got, expected, rtol=0, atol=rounding(light, area)[1] / (light[:2] > 0).mean() + 4 * EPS)
+
+
 @pytest.mark.parametrize("size", [1e-30, 1.0, 1e30, LARGEST / 4])
 def test_it_stays_finite_at_any_size(size: float) -> None:
     light = np.array([1.0, -1.0, 0.5, -0.25]) * size
@@ -222,13 +244,22 @@ def test_a_model_scales_and_answers_frames_alone(model: Model, data: Dataset) ->
     off = np.abs(signed[0] - signed[1]).max()
     # The level moves by at most the largest change over the share of the surface that pays, here all that is lit.
     payers = np.min(np.einsum("ltc,t->lc", whole > 0, model.area / model.area.sum())[whole.any(1)])
-    rounded = 2 * (len(model.area) + 5) * EPS * np.abs(signed[0]).max()
+    rounded = 2 * (np.ceil(np.log2(len(model.area))) + 5) * EPS * np.abs(signed[0]).max()
     assert np.abs(whole - alone).max() <= 2 * (off + rounded) / payers
 
 
-def test_unknown_clamps_are_refused(model: Model) -> None:
-    with pytest.raises(UserError, match="clamp: got 'soft'"):
-        model.predict(np.ones((24, 3)), clamp="soft")
+@pytest.mark.parametrize("unit", [1e-300, 1e-45, 1e38, 1e300])
+def test_a_model_keeps_energy_whatever_its_unit_of_area(model: Model, data: Dataset, unit: float) -> None:
+    values = data.values(data.split("test"), 24, "radiosity")
+    other = replace(model, area=model.area * 2.0 ** np.round(np.log2(unit)))
+    np.testing.assert_array_equal(other.predict(values, clamp="energy"), model.predict(values, clamp="energy"))
+
+
+@pytest.mark.parametrize("clamp", ["soft", None, 2, [True], np.array([True, False])], ids=str)
+def test_unknown_clamps_are_refused(model: Model, clamp: Any) -> None:
+    as_shipped = inspect.unwrap(Model.predict)  # without the type checks that tests run under
+    with pytest.raises(UserError, match="clamp: got"):
+        as_shipped(model, np.ones((24, 3)), clamp=clamp)
 
 
 # --- the ends of the range --------------------------------------------------------------------------------------------

@@ -99,10 +99,12 @@ def without_negatives(
 
     Args:
       light: linear light in any unit.
-      area: of the places, in any unit.
+      area: of the places, in any unit in which float32 tells the largest from 0.
     """
-    share = area / jnp.sum(area)
-    total = lambda values: jnp.einsum("lpc,p->lc", values, share, precision="highest")[:, None]  # noqa: E731
+    # A sum of areas may pass the range; one of relative areas does not.
+    relative = area[:, None] / jnp.minimum(jnp.max(area, initial=0), _DIVISIBLE)
+    share = relative / _sum_by_halves(relative[None])[0]
+    total = lambda values: _sum_by_halves(values * share)  # noqa: E731
     positive = jnp.maximum(light, 0)
     debt = total(positive - light)
 
@@ -115,6 +117,14 @@ def without_negatives(
 
     level, _ = jax.lax.while_loop(lambda state: state[1], step, (jnp.zeros_like(debt), jnp.array(True)))
     return jnp.where(debt < total(positive), jnp.maximum(positive - level, 0), 0)
+
+
+def _sum_by_halves(values: Float[Array, "lightings places _"]) -> Float[Array, "lightings 1 _"]:
+    """Sum over the places, off by the rounding of as many additions as there are halvings: one by one, equal values drift."""
+    while (half := values.shape[1] // 2) > 0:
+        folded = values[:, :half] + values[:, half : 2 * half]
+        values = folded if values.shape[1] % 2 == 0 else jnp.concatenate([folded, values[:, 2 * half :]], 1)
+    return jnp.sum(values, 1, keepdims=True)
 
 
 def _finite(light: Array) -> Array:

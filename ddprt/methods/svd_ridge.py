@@ -80,16 +80,19 @@ class SvdRidge(Method):
         """See `Method`; neither `validation` nor `key` is used.
 
         Raises:
-          UserError: a ridge per measurement that is not one per measurement and above 0, or that is to be smooth.
+          UserError: a ridge per measurement that is not one per measurement and above 0, or that is to be smooth; one basis
+            where the mean is that one.
         """
         if self.smooth and isinstance(self.ridge, tuple):
             raise UserError(
                 f"fit.ridge: got a ridge per measurement with smooth = {self.smooth:g}; give one number or auto, or smooth = 0"
             )
+        if self.bases == 1 and self.centre == "mean":
+            raise UserError("fit.bases: got 1 with centre = mean, which counts as one; raise it, or take the method mean")
         rows, _ = columns(train)
         entries = jnp.asarray(entry_weights(train.area, train.weights, train.channels))  # type: ignore[arg-type]
         centre = self.centre == "mean"
-        basis = fit_basis(rows, entries, bases=max(self.bases - centre, 1), centre=centre)
+        basis = fit_basis(rows, entries, bases=self.bases - centre, centre=centre)
         per_group = _spread(basis.coefficients, train, basis.vectors.shape[0])
         seen = measured(train) if basis.rank else []
         inputs = train.frame.values.shape[1] * (1 if train.channels == "mono" else 3)

@@ -19,6 +19,8 @@ from ddprt.methods.method import Frame, Relighter
 from ddprt.runtime.trust import Trust, Yardstick
 from ddprt.sampling.points import Samples
 
+_LARGEST = float(np.finfo(np.float32).max)
+
 
 @dataclass(frozen=True, eq=False)
 class Model:
@@ -63,19 +65,20 @@ class Model:
         Returns:
           (texels, 3) or (frames, texels, 3) float32, W/m², covered texels in row-major order.
         Raises:
-          UserError: wrong shape, not finite, no such clamp, or nothing to fade by.
+          UserError: wrong shape, not real numbers, not finite, no such clamp, or nothing to fade by.
         """
         frames, single = self._frames(values)
-        if clamp not in (True, False, "energy"):
+        if not isinstance(clamp, bool | np.bool_ | str) or clamp not in (True, False, "energy"):
             raise UserError(f'clamp: got {clamp!r}, expected True, False or "energy"')
         if fade and self.yardstick is None:
             raise UserError("fade: got a model of an older version, which knows no trust; fit it again")
-        area = jnp.asarray(self.area, jnp.float32) if clamp == "energy" else None
+        area = self._shares if clamp == "energy" else None
         light = np.asarray(_relight(self.relighter, self.encoding, frames, *self._places, bool(clamp), area))
         if fade and self.yardstick is not None:
             kept = self.yardstick.kept(self.yardstick.measure(self.encoding, frames).score)[:, None, None]
-            mean = self.predict(self.yardstick.mean, clamp=clamp) * np.asarray(self.encoding.scale(frames))[:, None]
-            light = np.where(kept < 1, kept * light + (1 - kept) * mean, light)
+            scale = np.asarray(self.encoding.scale(frames), np.float64)[:, None]
+            faded = kept * light + (1 - kept) * (self.predict(self.yardstick.mean, clamp=clamp) * scale)
+            light = np.where(kept < 1, np.clip(faded, -_LARGEST, _LARGEST), light).astype(np.float32)
         return light[0] if single else light
 
     def trust(self, values: Any) -> Trust | None:
@@ -84,7 +87,7 @@ class Model:
         Args:
           values: as for `predict`. Lamps that no measurement point sees are not told from lamps that are off.
         Raises:
-          UserError: wrong shape, or not finite.
+          UserError: wrong shape, not real numbers, or not finite.
         """
         frames, single = self._frames(values)
         if self.yardstick is None:
@@ -125,12 +128,12 @@ class Model:
 
     def _frames(self, values: Any) -> tuple[Float[Array, "frames points 3"], bool]:
         """Measured light as frames, and whether it was a single one."""
-        measured = np.asarray(values, np.float32)
+        measured = _real(values)
         single = measured.ndim == 2
         if measured.shape[-2:] != (self.points, 3) or measured.ndim not in (2, 3):
             raise UserError(f"values: got shape {measured.shape}, expected ({self.points}, 3) or (frames, {self.points}, 3)")
         if not np.isfinite(measured).all():
-            raise UserError("values: got NaN or infinity, expected finite W/m²; check the shading of the measurement points")
+            raise UserError("values: got NaN or infinity in float32, expected finite W/m²; check how the points are shaded")
         return jnp.asarray(measured[None] if single else measured), single
 
     @cached_property
@@ -141,10 +144,32 @@ class Model:
         )
 
     @cached_property
+    def _shares(self) -> Array:
+        # Shares before float32, which knows neither the sum of huge areas nor a tiny one.
+        return jnp.asarray(self.area / self.area.max(initial=np.finfo(float).tiny), jnp.float32)
+
+    @cached_property
     def _tracer(self) -> Any:
         from ddprt.transport.embree import Tracer
 
         return Tracer(self.occluders)
+
+
+def _real(values: Any) -> np.ndarray:
+    """What was given as float32, infinite where that is past its range.
+
+    Raises:
+      UserError: it is no array of real numbers.
+    """
+    expected = "expected an array of real numbers, W/m²; pass what the measurement points receive"
+    try:
+        given = np.asarray(values)
+    except ValueError:
+        raise UserError(f"values: got rows of unequal length, {expected}") from None
+    if not (jnp.issubdtype(given.dtype, jnp.floating) or jnp.issubdtype(given.dtype, jnp.integer)):
+        raise UserError(f"values: got {given.dtype} entries, {expected}")
+    with np.errstate(over="ignore"):
+        return given.astype(np.float32, copy=False)
 
 
 @jax.jit

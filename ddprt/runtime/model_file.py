@@ -1,12 +1,18 @@
-"""A model on disk: model.json and tensors.safetensors, self-contained, no pickle."""
+"""A model on disk: model.json and tensors.safetensors, self-contained, no pickle.
 
+model.json carries the SHA-256 of the tensors, so that a damaged model is refused rather than answered from. Models of versions
+that wrote none are told by its absence; of theirs it is known only that all numbers are finite and in range.
+"""
+
+import hashlib
 import json
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from ddprt import __version__
 from ddprt.errors import UserError
@@ -19,6 +25,42 @@ from ddprt.runtime.trust import Yardstick
 from ddprt.sampling.points import Samples
 
 SCHEMA = 1
+
+
+class _Part(BaseModel):
+    """Numbers of model.json: finite and in range, or the file is damaged."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+
+class _Encoding(_Part):
+    space: Literal["linear", "gamma"]
+    gamma: float = Field(ge=1, le=10)
+    channels: Literal["mono", "multi"]
+
+
+class _Points(_Part):
+    count: int = Field(ge=1)
+    quantity: Literal["radiosity", "irradiance"]
+    spacing: float = Field(ge=0)
+    depth: float = Field(0.0, ge=0)
+
+
+class _Trust(_Part):
+    ridge: float = Field(gt=0)
+    exponent: float = Field(ge=0)
+    level: float = Field(ge=0)
+    fade_from: float = Field(ge=0, le=1)
+
+
+class _Document(BaseModel):
+    """What model.json holds; keys of later versions of the same schema are passed over."""
+
+    encoding: _Encoding
+    points: _Points
+    report: FitReport
+    trust: _Trust | None = None
+    tensors_sha256: str | None = None
 
 
 def save_model(model: Model, folder: Path) -> None:
@@ -57,6 +99,7 @@ def save_model(model: Model, folder: Path) -> None:
             tensors |= {f"relighter.{entry.name}.{i}": np.asarray(part) for i, part in enumerate(value)}
         else:
             tensors[f"relighter.{entry.name}"] = np.asarray(value)
+    write_tensors(folder / "tensors.safetensors", tensors)
     document = {
         "schema": SCHEMA,
         "ddprt": __version__,
@@ -73,8 +116,8 @@ def save_model(model: Model, folder: Path) -> None:
         "report": asdict(model.relighter.report),
         "trust": trust or None,
         "unit": "W/m2",
+        "tensors_sha256": _sha256(folder / "tensors.safetensors"),
     }
-    write_tensors(folder / "tensors.safetensors", tensors)
     write_text(folder / "model.json", json.dumps(document, indent=1) + "\n")
 
 
@@ -92,67 +135,78 @@ def load_model(folder: str | Path) -> Model:
         raise UserError(f"{folder}: got {error.strerror or error}, expected a model folder; fit one first") from None
     except (ValueError, KeyError, TypeError):
         raise UserError(f"{folder / 'model.json'}: not a model description; fit it again") from None
-    if schema != SCHEMA:
+    if type(schema) is not int or schema != SCHEMA:
         raise UserError(f"{folder}: got model schema {schema}, expected {SCHEMA}; fit it again with this version")
     tensors = read_tensors(folder / "tensors.safetensors")
     try:
         relighter_type = METHODS[document["method"]].relighter
-        model = _assemble(document, tensors, relighter_type)
+        checked = _Document.model_validate(document)
+        if checked.tensors_sha256 not in (None, _sha256(folder / "tensors.safetensors")):
+            raise ValueError("the tensors are not those that were saved: their checksum is another")
+        odd = [name for name, array in tensors.items() if not np.isfinite(array).all()]
+        if odd:
+            raise ValueError(f"got NaN or infinity in {odd[0]}")
+        model = _assemble(document, checked, tensors, relighter_type)
         model.predict(np.zeros((model.points, 3)))
         model.trust(np.zeros((model.points, 3)))
     except UserError:
         raise
+    except ValidationError as error:
+        fault = error.errors()[0]
+        place = ".".join(map(str, fault["loc"]))
+        raise UserError(
+            f"{folder / 'model.json'}: {place}: got {repr(fault['input'])[:60]}, expected: {fault['msg']}; fit it again"
+        ) from None
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         why = " ".join(str(error).split())[:120]
         raise UserError(f"{folder}: model.json and tensors.safetensors do not fit together ({why}); fit it again") from None
     return model
 
 
-def _assemble(document: dict[str, Any], tensors: dict[str, np.ndarray], relighter_type: type) -> Model:
+def _assemble(document: dict[str, Any], checked: _Document, tensors: dict[str, np.ndarray], relighter_type: type) -> Model:
     arguments: dict[str, Any] = {}
     for entry in fields(relighter_type):
         static = document["relighter"].get(entry.name)
         if entry.name == "report":
-            arguments["report"] = FitReport(**{key: _tuples(value) for key, value in document["report"].items()})
+            arguments["report"] = checked.report
         elif isinstance(static, dict):
             arguments[entry.name] = tuple(jnp.asarray(tensors[f"relighter.{entry.name}.{i}"]) for i in range(static["tuple"]))
         elif entry.name in document["relighter"]:
             arguments[entry.name] = static
         else:
             arguments[entry.name] = jnp.asarray(tensors[f"relighter.{entry.name}"])
-    places, encoding = document["points"], document["encoding"]
-    words = {encoding["space"]: ("linear", "gamma"), encoding["channels"]: ("mono", "multi")}
-    words |= {places["quantity"]: ("radiosity", "irradiance")}
-    for word, known in words.items():
-        if word not in known:
-            raise ValueError(f"got {word!r}, expected {' or '.join(known)}")
-    if not 0 < int(places["count"]) <= len(tensors["points.position"]):
-        raise ValueError(f"got {places['count']} points")
+    places = checked.points
+    if places.count > len(tensors["points.position"]):
+        raise ValueError(f"got {places.count} points")
     uv = tensors.get("scene.uv")
     if uv is not None and uv.shape != (len(tensors["scene.corners"]), 3, 2):
         raise ValueError(f"got lightmap coordinates of shape {uv.shape}")
     position, normal, albedo = (tensors[f"points.{name}"] for name in ("position", "normal", "albedo"))
-    samples = Samples(position, normal, albedo, places["spacing"], places.get("depth", 0.0))
+    samples = Samples(position, normal, albedo, places.spacing, places.depth)
     return Model(
         document["method"],
         relighter_type(**arguments),
-        Encoding(**document["encoding"]),
+        Encoding(**checked.encoding.model_dump()),
         samples,
-        places["count"],
-        places["quantity"],
+        places.count,
+        places.quantity,
         tensors["atlas.covered"],
         tensors["atlas.area"],
         tensors["scene.corners"],
         document["scene"],
         uv,
-        None if document.get("trust") is None else _yardstick(document["trust"], tensors),
+        None if checked.trust is None else _yardstick(checked.trust, tensors),
     )
 
 
-def _yardstick(numbers: dict[str, float], tensors: dict[str, np.ndarray]) -> Yardstick:
+def _yardstick(numbers: _Trust, tensors: dict[str, np.ndarray]) -> Yardstick:
     directions, shares, mean = (tensors[f"trust.{name}"] for name in ("directions", "shares", "mean"))
-    return Yardstick(directions, shares, mean, **{name: float(value) for name, value in numbers.items()})
+    return Yardstick(directions, shares, mean, **numbers.model_dump())
 
 
-def _tuples(value: Any) -> Any:
-    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+def _sha256(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror or error}); mend the folder's permissions") from None

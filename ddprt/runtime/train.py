@@ -1,6 +1,6 @@
 """From a dataset to a Model."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -36,7 +36,7 @@ def fit(
     method: str = "svd-ridge",
     *,
     bases: int = 16,
-    ridge: float | str | tuple[float, ...] = "auto",
+    ridge: float | str | Sequence[float] | np.ndarray = "auto",
     space: str = "linear",
     gamma: float = 2.2,
     centre: str = "none",
@@ -70,8 +70,12 @@ def fit(
     shared = {"method": method, "bases": bases, "ridge": ridge, "space": space, "gamma": gamma}
     shared |= {"centre": centre, "channels": channels, "weights": weights}
     overrides = {f"fit.{key}": _text(value) for key, value in shared.items()}
-    config = load_config(None, overrides).fit
-    return fit_method(data, config, method, settings or {}, points=points, quantity=quantity, seed=seed)
+    overrides |= {"points.quantity": _text(quantity), "seed": _text(seed)}
+    if points is not None:
+        overrides["points.count"] = _text(points)
+    config = load_config(None, overrides)
+    count = None if points is None else config.points.count
+    return fit_method(data, config.fit, method, settings or {}, points=count, quantity=config.points.quantity, seed=config.seed)
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")  # the last bits of LAPACK's factors depend on how many threads it has
@@ -90,6 +94,8 @@ def fit_method(
     points = data.description["points"]["count"] if points is None else points
     if points > len(data.samples.position):
         raise UserError(f"points: got {points}, but the dataset has {len(data.samples.position)} samples; bake with more")
+    if not data.area.sum() > 0:
+        raise UserError("area: got texels of 0 m² alone, expected some surface to light; check the atlas and bake again")
     encoding = Encoding(config.space, config.gamma, config.channels)
     train, validation = (examples(data, split, encoding, config, points, quantity) for split in ("train", "validation"))
     relighter = method.fit(train, validation, key=jax.random.key(seeds.number(seed, f"method {name}")))
@@ -190,4 +196,7 @@ def fit_config(data: Dataset, config: Config, name: str) -> Model:
 
 
 def _text(value: Any) -> str:
-    return value if isinstance(value, str) else str(list(value)) if isinstance(value, tuple) else repr(value)
+    plain = value.tolist() if isinstance(value, np.ndarray | np.generic | Array) else value
+    if isinstance(plain, list | tuple):
+        return f"[{', '.join(map(_text, plain))}]"
+    return plain if isinstance(plain, str) else repr(plain)

@@ -79,7 +79,9 @@ class Yardstick:
 
     def measure(self, encoding: Encoding, values: Float[Array, "frames points 3"]) -> Trust:
         """Trust of frames of measured light, W/m²."""
-        novelty, leverage, unexplained = map(np.asarray, _measure(self.directions, self.shares, encoding, values))
+        found = _measure(self.directions, self.shares, encoding, _below_the_cap(values))
+        novelty, leverage, unexplained = map(np.asarray, found)
+        novelty = np.where(np.isfinite(novelty), novelty, 1)  # what cannot be told is not trusted
         error = np.where(novelty > 0, novelty**self.exponent, 0)
         return Trust(1 - error, leverage / self.ridge, unexplained, novelty > self.level)
 
@@ -181,6 +183,12 @@ def _mean(train: Examples, encoding: Encoding) -> np.ndarray:
     weight = (scale / max(float(scale.max(initial=0)), float(np.finfo(np.float32).tiny))) ** 2
     linear = np.asarray(encoding.decode(train.frame.values, jnp.ones_like(train.scale), clamp=False), np.float64)
     return (np.einsum("lc,lpc->pc", weight, linear) / np.maximum(weight.sum(0), 1e-300)).astype(np.float32)
+
+
+@jax.jit
+def _below_the_cap(values: Array) -> Array:
+    """Light of which no scale meets its end at 2^126, where norms are not 1; powers of two take no digit off it."""
+    return values * jnp.where(jnp.max(jnp.abs(values), (1, 2), keepdims=True, initial=0) > 2.0**90, 2.0**-32, 1)
 
 
 @jax.jit
