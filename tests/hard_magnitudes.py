@@ -51,13 +51,13 @@ def _at_the_end(power: int, **options: Any) -> Callable[[], Outcome]:
     """Light times 2^power is answered by 2^power times as much, cut at the largest number, whatever is asked of the answer.
 
     Both answers round, by e at most in the worst texel (`oracles.bound_predict`). The level that pays for negative light moves
-    by as much, and by the (n + 4) u32 of a sum, over the share of the area that pays. Fading from a share of a map to another
-    moves by the error of that share times both, see `_error_of_share`.
+    by as much, and by the (n + 4) u32 of a sum, over the share of the area that pays; its energy is that of the map before.
+    Fading from a share of a map to another moves by the error of that share times both, see `_error_of_share`.
     """
 
     def run() -> Outcome:
         measured, indirect = room()
-        data = make_data(measured, indirect)
+        data = make_data(measured, 8 * indirect)  # so bright that some of it is past the range at the upper end
         model = ddprt.fit(data, bases=BASES, ridge=1e-3)
         middle = (_UNLIKE * 0.99).astype(np.float32)
         plain, light = (np.asarray(model.predict(part, **options), float) for part in (middle, np.ldexp(middle, power)))
@@ -67,14 +67,19 @@ def _at_the_end(power: int, **options: Any) -> Callable[[], Outcome]:
         )
         error = (np.ldexp(near, power) + far).max(1, keepdims=True)
         peak = np.ldexp(np.abs(np.asarray(model.predict(middle, clamp=False), float)).max(1, keepdims=True), power)
+        whole = 0.0
         error += 4 * U32 * peak + 3 * oracles.TINY32
         if options.get("clamp") == "energy":
-            paying = np.einsum("ltc,t->lc", model.predict(middle, clamp="energy") > 0, data.area / data.area.sum())[:, None]
+            share = data.area / data.area.sum()
+            clamped, free = (np.asarray(model.predict(middle, clamp=how), float) for how in ("energy", False))
+            paying = np.einsum("ltc,t->lc", clamped > 0, share)[:, None]
+            kept = np.einsum("ltc,t->lc", clamped, share) - np.maximum(np.einsum("ltc,t->lc", free, share), 0)
+            whole = over_bound(kept, (rounding(TEXELS + 4, U32) * np.abs(free) + 2 * near).max(1))
             error = (error + rounding(TEXELS + 4, U32) * peak) * (1 + 1 / np.where(paying > 0, paying, np.inf))
         if options.get("fade"):
             error = error + 2 * _error_of_share(model, middle)[:, None, None] * 2 * peak
         return Outcome(
-            max(over_bound(light - truth, error), judge(data, model)),
+            max(whole, over_bound(light - truth, error), judge(data, model)),
             model.relighter.report.status,
             bool(np.isfinite(light).all()),
         )
