@@ -8,6 +8,7 @@ import hard_bakes
 import numpy as np
 from hard_arrays import BASES, TEST, TEXELS, Arrays, make_data, refusal, room
 from hard_cases import REFUSED, HardCase, Outcome
+from oracles import U32, over_bound, rounding
 
 import ddprt
 from ddprt.dataset import store
@@ -46,6 +47,18 @@ def _imported(kind: str, value: float, *, split: str = "train") -> Callable[[], 
             return Outcome(np.inf, model.relighter.report.status, bool(np.isfinite(light).all()))
 
     return run
+
+
+def _overflowing_samples() -> Outcome:
+    """Ten samples in five points whose sum is past float32 though their mean is not: the mean, up to its own rounding."""
+    measured, indirect = room()
+    data = make_data(measured, indirect)
+    data.measured_light[1] = 3e38
+    with tempfile.TemporaryDirectory() as name:
+        on_disk(data, Path(name))
+        found = ddprt.open_dataset(name).values([1], 5, "irradiance")
+    exact = float(np.float32(3e38))
+    return Outcome(over_bound(found - exact, rounding(10, U32) * exact), "ok", bool(np.isfinite(found).all()))
 
 
 def raw_exr(path: Path, image: np.ndarray, attributes: dict[str, str] | None = None) -> None:
@@ -169,6 +182,7 @@ CASES: tuple[HardCase, ...] = (
         _imported("area", np.nan),
         REFUSED,
     ),
+    HardCase("supersamples whose sum is past float32", "their mean is not", "the mean, within rounding", _overflowing_samples),
     HardCase("NaN asked at run time", "an engine divides by 0", "refused", _refuses_values(np.nan), REFUSED),
     HardCase("infinity asked at run time", "an engine overflows", "refused", _refuses_values(-np.inf), REFUSED),
     *(

@@ -136,7 +136,6 @@ CASES: tuple[HardCase, ...] = (
         "the power brings faint texels up",
         WITHIN,
         relit(changed(high_dynamic_range), space="gamma"),
-        frozenset({"ill_conditioned"}),
     ),
     HardCase("gamma 1", "the power that is none", WITHIN, relit(changed(noisy), _NOISE, space="gamma", gamma=1.0), slow=True),
     HardCase(
@@ -165,13 +164,13 @@ CASES: tuple[HardCase, ...] = (
         "light differs in the last three digits of float32",
         WITHIN,
         relit(changed(offset)),
-        frozenset({"ill_conditioned"}),
     ),
     HardCase(
         "huge common offset, mean",
         "centring cancels all but the last three digits",
         WITHIN,
         relit(changed(offset), centre="mean"),
+        frozenset({"ok", "overfitted"}),  # lightings differ by 1e-4: those that count as one are left out together
         slow=True,
     ),
     HardCase("a foreign lighting", "signs, sizes and directions that no training lighting had", WITHIN, relit(room, _FOREIGN)),

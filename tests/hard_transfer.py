@@ -200,6 +200,20 @@ CASES: tuple[HardCase, ...] = (
         transferred(problem, (1.0,) * 9 + (np.inf,), says="fit.ridge: got inf"),
         REFUSED,
     ),
+    *(
+        HardCase(
+            f"ridge per point, {what}",
+            "measurements are stretched by 1 / sqrt(ridge), and squared",
+            "refused",
+            transferred(problem, ridge, says="fit.ridge: got"),
+            REFUSED,
+        )
+        for what, ridge in (
+            ("all 1e-300", (1e-300,) * 10),
+            ("all the smallest number", (5e-324,) * 10),
+            ("from 1e-300 to 1e3", tuple(np.logspace(-300, 3, 10).tolist())),
+        )
+    ),
     HardCase(
         "Hilbert measurements, pseudo-inverse",
         "condition 1e13 before rounding, 1e8 after",
