@@ -17,15 +17,12 @@ import ddprt
 from ddprt.dataset import store
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
-from ddprt.methods.statuses import STATUSES
 from ddprt.runtime.model import Model
 from ddprt.sampling.points import Samples
 
 TRAIN, VALIDATION, TEST = 12, 3, 4
 POINTS, TEXELS, BASES = 10, 23, 6
 LAMP = {"type": "point", "position": [0.0, 1.0, 0.0], "intensity": [1.0, 1.0, 1.0]}
-WARNED = frozenset(STATUSES) - {"ok"} | {"refused"}
-ANY = WARNED | {"ok"}  # the case is about the numbers; what the status should be is not for it to say
 WITHIN = "every layer is within its bound"
 
 
@@ -107,9 +104,10 @@ def predicts_lawfully(model: Model, values: np.ndarray) -> float:
     return 0.0 if same and double and (model.predict(0 * values) == 0).all() else np.inf
 
 
-def refusal(error: UserError) -> Outcome:
-    """A refusal is right if it is one clear line that says what it got."""
-    return Outcome(0.0 if "\n" not in str(error) and "got" in str(error) else np.inf, "refused")
+def refusal(error: UserError, says: str = "") -> Outcome:
+    """A refusal is right if one is asked for, and it is one clear line with what it says; of nothing else is it an answer."""
+    line = str(error)
+    return Outcome(0.0 if says and says in line and "got" in line and "\n" not in line else np.inf, "refused")
 
 
 def relit(
@@ -117,9 +115,13 @@ def relit(
     probes: np.ndarray | None = None,
     area: np.ndarray | None = None,
     method: str = "svd-ridge",
+    says: str = "",
     **options: Any,
 ) -> Callable[[], Outcome]:
-    """A case: fit the columns, keep the laws of every method, and judge a linear one layer by layer."""
+    """A case: fit the columns, keep the laws of every method, and judge a linear one layer by layer.
+
+    Where it must be refused, `says` is a piece of the line to look for.
+    """
 
     def run() -> Outcome:
         measured, indirect = make()
@@ -128,7 +130,7 @@ def relit(
         try:
             model = ddprt.fit(data, method, **{"bases": BASES, **options})
         except UserError as error:
-            return refusal(error)
+            return refusal(error, says)
         light = model.predict(asked)
         worst = predicts_lawfully(model, asked)
         if method == "svd-ridge":

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import oracles
-from hard_arrays import ANY, POINTS, TEST, TEXELS, TRAIN, VALIDATION, WITHIN, relit, room
+from hard_arrays import POINTS, TEST, TEXELS, TRAIN, VALIDATION, WITHIN, relit, room
 from hard_cases import HardCase, Outcome
 from oracles import U32, over_bound
 
@@ -65,21 +65,25 @@ _AREA = np.where(np.arange(TEXELS) == 4, 0.0, 1.0)
 
 
 CASES: tuple[HardCase, ...] = (
-    HardCase("a texel without area", "its weight is 0 under a root", WITHIN, relit(room, area=_AREA), ANY),
+    HardCase("a texel without area", "its weight is 0 under a root", WITHIN, relit(room, area=_AREA)),
     HardCase(
         "areas over twelve decades",
         "weights of 1e-12 divide when vectors are made",
         WITHIN,
         relit(room, area=np.logspace(-12, 0, TEXELS)),
-        ANY,
     ),
-    HardCase("mean and mono", "an intercept beside three channels", WITHIN, relit(room, centre="mean"), ANY),
+    HardCase(
+        "mean and mono",
+        "an intercept beside three channels",
+        WITHIN,
+        relit(room, centre="mean"),
+        frozenset({"ok", "ill_conditioned"}),  # two of ten directions are rounding, on either side of the cut
+    ),
     HardCase(
         "mean and multi",
         "an intercept beside interleaved colours",
         WITHIN,
         relit(room, centre="mean", channels="multi"),
-        ANY,
         slow=True,
     ),
     HardCase(
@@ -87,7 +91,6 @@ CASES: tuple[HardCase, ...] = (
         "any rotation of three vectors is as good",
         "the space is right whatever the rotation",
         relit(_clustered),
-        ANY,
     ),
     HardCase(
         "leading subspaces over six decades",
@@ -101,7 +104,6 @@ CASES: tuple[HardCase, ...] = (
         "no tile or vector register divides them",
         WITHIN,
         relit(lambda: room(train=13, points=7, texels=31)),
-        ANY,
         slow=True,
     ),
     HardCase(
@@ -109,12 +111,30 @@ CASES: tuple[HardCase, ...] = (
         "sums are cut into pieces of 16384",
         WITHIN,
         relit(lambda: room(texels=16411)),
-        ANY,
         slow=True,
     ),
-    HardCase("one texel", "one number is the whole map", WITHIN, relit(lambda: room(texels=1)), ANY, slow=True),
     HardCase(
-        "one point", "light is scaled by the very number it is told by", WITHIN, relit(lambda: room(points=1)), ANY, slow=True
+        "one texel",
+        "one number is the whole map",
+        WITHIN,
+        relit(lambda: room(texels=1)),
+        frozenset({"rank_deficient"}),
+        slow=True,
     ),
-    HardCase("more points than texels", "the wide way round", WITHIN, relit(lambda: room(points=40, texels=3)), ANY, slow=True),
+    HardCase(
+        "one point",
+        "light is scaled by the very number it is told by",
+        WITHIN,
+        relit(lambda: room(points=1)),
+        frozenset({"rank_deficient"}),
+        slow=True,
+    ),
+    HardCase(
+        "more points than texels",
+        "the wide way round",
+        WITHIN,
+        relit(lambda: room(points=40, texels=3)),
+        frozenset({"rank_deficient"}),
+        slow=True,
+    ),
 )

@@ -61,6 +61,7 @@ FILES = (
     "hard_stores",
     "hard_imports",
     "hard_learners",
+    "hard_splits",
     "hard_bounces",
     "hard_lights",
     "hard_extents",

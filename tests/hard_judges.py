@@ -107,13 +107,47 @@ def right_transfer(X: np.ndarray, C: np.ndarray, ridge: Any, doubt: float = 0.0)
     return M / root, (bound + np.linalg.norm(C) * S[rank] / ridge if held else 2 * bound) / root
 
 
+def right_answers(X: np.ndarray, C: np.ndarray, ridge: Any, doubt: float = 0.0) -> tuple[np.ndarray, float]:
+    """X M^T of centred data on the directions that count, and how far (Frobenius) a float32 M may leave it.
+
+    Where X is ill-conditioned and little ridge holds it, M is known to nothing while X M^T, and with it the residual, is known
+    well: a matrix of zeros, or of 1.01 M, breaks this statement. A backward stable SVD solves the problem of X + dX,
+    ||dX|| <= p u64 sigma_1. Its best approximation of rank r moves by that times 1 + 2 sigma_r / gap, gap being
+    sigma_r - sigma_r+1, and with G as in `oracles.bound_ridge` X M^T moves by
+    ||dX|| (||C - X M^T|| ||X G|| + ||X G X^T|| ||M||), once more ||dX|| ||M|| for what the kept directions take of the dropped
+    ones. ||X G|| is the largest s / (s² + ridge) from sigma_r to sigma_1, ||X G X^T|| = sigma_1² / (sigma_1² + ridge) <= 1; the
+    products round p u64 ||C|| of it. All of that twice, since the float64 twin is no better; float32 storage adds
+    (u32 |M| + the smallest normal number) |X|, and a C that is off by `doubt` adds that.
+    """
+    plain = np.linalg.svd(X, compute_uv=False)
+    rank = int((plain > RANK_CUT * plain[0]).sum())
+    if rank == 0:
+        return np.zeros(C.shape), 0.0
+    root = np.sqrt(np.array(ridge)) if isinstance(ridge, tuple) else np.ones(X.shape[1])
+    ridge = 1.0 if isinstance(ridge, tuple) else ridge
+    Q, S, Pt = np.linalg.svd(X / root, full_matrices=False)
+    Q, kept, Pt = Q[:, :rank], S[:rank], Pt[:rank]
+    M = (C.T @ Q * (kept / (kept**2 + ridge))) @ Pt
+    answers = (Q * (kept**2 / (kept**2 + ridge))) @ (Q.T @ C)
+    share = float(kept[0] ** 2 / (kept[0] ** 2 + ridge))
+    steep = np.clip(np.sqrt(ridge), kept[-1], kept[0])
+    p, gap = rounding(2 * sum(X.shape), U64), kept[-1] - (S[rank] if rank < len(S) else 0.0)
+    dX = p * kept[0] * (1 + 2 * kept[-1] / gap)
+    size = float(np.linalg.norm(C))
+    own = dX * (np.linalg.norm(C - answers) * steep / (steep**2 + ridge) + 2 * np.linalg.norm(M)) + p * size * share
+    stored = float(np.linalg.norm(np.abs(X) @ (U32 * np.abs(M / root) + TINY32).T))
+    return answers, 2 * float(own) + stored + doubt * share
+
+
 def judge_transfer(X: np.ndarray, C: np.ndarray, doubt: np.ndarray, ridge: Any, parts: list[np.ndarray], centre: bool) -> float:
-    """Means and ridge solution, at the ridge that was given or reported."""
+    """Means, ridge solution and what it answers to the training lightings, at the ridge that was given or reported."""
     M, offset, start = parts
     d0, c0 = (X.mean(0), C.mean(0)) if centre else (np.zeros(X.shape[1]), np.zeros(C.shape[1]))
     mean_error = rounding(len(X), U64)
     exact, bound = right_transfer(X - d0, C - c0, ridge, float(np.linalg.norm(doubt)))
+    fitted, moved = right_answers(X - d0, C - c0, ridge, float(np.linalg.norm(doubt)))
     return max(
+        over_bound(float(np.linalg.norm((X - d0) @ M.T - fitted)), moved),
         over_bound(offset - d0, U32 * np.abs(d0) + mean_error * np.abs(X).max(0) + TINY32),
         over_bound(start - c0, U32 * np.abs(c0) + doubt.max(0) + mean_error * np.abs(C).max(0) + TINY32),
         over_bound(M - exact, bound),

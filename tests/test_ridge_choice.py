@@ -161,6 +161,24 @@ def test_units_of_importance_do_not_matter(factor: float) -> None:
     np.testing.assert_allclose(plain.path, scaled.path, rtol=50 * EPS64)
 
 
+@pytest.mark.parametrize("size", [5e-324, 1e-310, 1e308])
+def test_importance_at_the_ends_of_the_range(size: float) -> None:
+    """A sum of twelve of the largest would be infinite, and a product with the smallest has no digits."""
+    X, C = problem(12, 20)
+    np.testing.assert_array_equal(chosen(X, C, np.full(12, size)).path, chosen(X, C).path)
+
+
+def test_what_is_predicted_exactly_counts_as_predicted_to_rounding() -> None:
+    """Each lighting has a point of its own, so that left out it is predicted as black; one is black, and one decides alone.
+
+    Their geometric mean has a floor of one float64 rounding, below which no residual tells anything: the fifth root of
+    1 * 1 * 1 * 1000 * eps at every ridge, each logarithm and the root rounded.
+    """
+    choice = chosen(np.eye(5, dtype=np.float32), np.array([[1], [1], [1], [1000], [0]], np.float32))
+    assert "dominated" in choice.remarks
+    np.testing.assert_allclose(choice.path[:, 1], (1e3 * EPS64) ** 0.2, rtol=5 * 36 * EPS64)  # |log eps| = 36, five of them
+
+
 def test_importance_of_zero_counts_all_alike() -> None:
     X, C = problem(12, 20)
     np.testing.assert_array_equal(chosen(X, C, np.zeros(12)).path, chosen(X, C).path)
@@ -325,6 +343,49 @@ def test_every_status_has_a_dataset(status: str) -> None:
     if status not in NOTES and status != "ok":
         assert found.status == worst_first(set(found.remarks))[0]
         assert found.status != "ok"
+
+
+def remarks(X: object, C: object, ridge: float, importance: object = None) -> tuple[str, ...]:
+    weight = None if importance is None else jnp.asarray(importance, jnp.float32)
+    return fit_transfer(jnp.asarray(X, jnp.float32), jnp.asarray(C, jnp.float32), ridge=ridge, importance=weight).remarks
+
+
+@pytest.mark.parametrize(
+    ("smallest", "ridge", "said"), [(5e-6, 0, False), (1e-6, 0, True), (1e-6, 8e-12, True), (1e-6, 8e-11, False)]
+)
+def test_limits_of_ill_conditioning(smallest: float, ridge: float, said: bool) -> None:
+    """A condition past a million, and a ridge of no more than the square of a millionth of the largest singular value.
+
+    Here that is 4: 1.6e-11. A ridge of that times 5 holds back all that condition would blow up.
+    """
+    assert ("ill_conditioned" in remarks(np.diag([4, 2, smallest]), np.eye(3), ridge)) is said
+
+
+@pytest.mark.parametrize(("ridge", "said"), [(3.9, False), (4.1, True)])
+def test_limits_of_overdamping(ridge: float, said: bool) -> None:
+    """More than half is taken of a direction whose squared singular value, here 4, is less than the ridge."""
+    assert ("overdamped" in remarks(np.diag([2, 1, 1]), np.eye(3), ridge)) is said
+
+
+@pytest.mark.parametrize(("importance", "said"), [(None, True), ([1, 1, 0.01, 0.01], False), ([0.01, 0.01, 1, 1], True)])
+def test_overfitting_heeds_importance(importance: list[float] | None, said: bool) -> None:
+    """Two points that see two lightings each: from one to the other the first predicts all, the second the opposite.
+
+    Squared errors left out are 0, 0, 4 and 16 where black makes 1, 4, 1 and 4.
+    """
+    X, C = [[1, 0], [2, 0], [0, 1], [0, 2]], [[1], [2], [1], [-2]]
+    assert ("overfitted" in remarks(X, C, 0, importance)) is said
+
+
+def test_condition_is_of_what_counts() -> None:
+    """Singular values 4, 2 and one of rounding: rank 2 and condition 2."""
+    fit = fit_transfer(jnp.diag(jnp.array([4.0, 2.0, 1e-7])), jnp.eye(3), ridge=0.0)
+    assert fit.rank == 2
+    assert fit.condition == pytest.approx(2, rel=10 * EPS64)  # two backward stable singular values and a quotient
+
+
+def test_a_ridge_per_point_is_reported_by_its_mean() -> None:
+    assert fit_transfer(*(jnp.asarray(part) for part in problem(12, 3)), ridge=(1.0, 2.0, 6.0)).ridge == 3
 
 
 def test_every_status_says_what_why_and_what_to_do() -> None:
