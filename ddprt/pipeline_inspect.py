@@ -110,13 +110,10 @@ def _some_lightings(config: Config, scene: Any, tracer: Any) -> tuple[Any, list[
 
 def _direct(config: Config, tracer: Any, atlas: Any, lightings: Any) -> list[np.ndarray]:
     """Direct light of each lighting on the texels."""
-    from ddprt.transport.direct import on_texels, texel_irradiance
+    from ddprt.transport.direct import Texels
 
-    places = on_texels(tracer, atlas, config.transport.direct_samples, seeds.stream(config.seed, "texel positions"))
-    return [
-        texel_irradiance(tracer, atlas, lighting, places, seeds.stream(config.seed, "direct", index))
-        for index, lighting in enumerate(lightings)
-    ]
+    texels = Texels.of(tracer, atlas, config.transport.direct_samples, seeds.stream(config.seed, "texel positions"))
+    return [texels.irradiance(lighting, seeds.stream(config.seed, "direct", index)) for index, lighting in enumerate(lightings)]
 
 
 def _darkness(lightings: Any, direct: list[np.ndarray], scene: Any, tracer: Any) -> list[str]:

@@ -34,7 +34,7 @@ from ddprt.dataset.store import Manifest
 from ddprt.errors import UserError
 from ddprt.lights import Lighting
 from ddprt.progress import Progress
-from ddprt.transport.direct import centred, mean_irradiance, on_texels
+from ddprt.transport.direct import Texels, centred, mean_irradiance
 from ddprt.transport.embree import Tracer
 from ddprt.transport.footprint import find_footprints
 from ddprt.transport.gather import Pattern, Receivers, seen_from
@@ -48,7 +48,7 @@ def share_of_embree(on: Stage, rounds: int = 5) -> dict[str, float]:
     operator = Operator.of(tracer, atlas)
     receivers = Receivers.texels(atlas, 256, 0, "rate")
     tiles = list(receivers.tiles())[:128]
-    places = on_texels(tracer, atlas, 4, seeds.stream(0, "texel positions"))
+    places = Texels.of(tracer, atlas, 4, seeds.stream(0, "texel positions")).places
     lightings = [centred(tracer, lighting) for lighting in on.train[:32]]
 
     def gather(tile: slice) -> None:
@@ -110,7 +110,7 @@ def sampling() -> None:
     """Noise of independent rays, of Sobol blocks dealt out at random and in Z-order: of a texel and of 5 x 5 means."""
     on = stage("cornell", RESOLUTION, 8, 1)
     operator, count = Operator.of(on.tracer, on.atlas), on.atlas.count
-    places = on_texels(on.tracer, on.atlas, 4, seeds.stream(0, "texel positions"))
+    places = Texels.of(on.tracer, on.atlas, 4, seeds.stream(0, "texel positions")).places
     lights = [mean_irradiance(on.tracer, centred(on.tracer, light), places, seeds.stream(0, "d")) for light in on.train]
     sent = np.concatenate([operator.averaged(light) for light in lights], 1)
     radiosity = operator.bounce(sent, seed=0, stream="sampling").radiosity

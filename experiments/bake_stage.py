@@ -25,7 +25,7 @@ from ddprt.lights import Lighting
 from ddprt.sampling.lightings import draw_lightings
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
-from ddprt.transport.direct import on_texels, texel_irradiance
+from ddprt.transport.direct import Texels
 from ddprt.transport.effort import choose_rays
 from ddprt.transport.embree import Tracer
 from ddprt.transport.openness import build_open_atlas
@@ -70,11 +70,11 @@ def bake(
     transport = on.config.transport.model_copy(update={"samples": samples})
     start = time.perf_counter()
     address = stream.encode()
-    places = on_texels(tracer, atlas, transport.direct_samples, seeds.stream(0, "texel positions", *address))
+    texels = Texels.of(tracer, atlas, transport.direct_samples, seeds.stream(0, "texel positions", *address))
     operator = Operator.of(tracer, atlas, transport.sender_resolution)
 
     def direct(index: int) -> np.ndarray:
-        light = texel_irradiance(tracer, atlas, lightings[index], places, seeds.stream(0, "direct", index, *address))
+        light = texels.irradiance(lightings[index], seeds.stream(0, "direct", index, *address))
         return operator.averaged(light)
 
     sent = np.concatenate(list(tracer.map(direct, range(len(lightings)))), 1)

@@ -13,7 +13,7 @@ from ddprt.scene.atlas import Atlas, build_atlas
 from ddprt.scene.mesh import Material, Scene
 from ddprt.scene.shapes import faceted, rectangle
 from ddprt.transport import direct
-from ddprt.transport.direct import Places, centred, direct_irradiance, mean_irradiance, on_texels, texel_irradiance
+from ddprt.transport.direct import Places, Texels, centred, direct_irradiance, mean_irradiance
 from ddprt.transport.embree import Tracer, lifted
 
 POINT = {"type": "point", "position": [0.28, 0.45, 0.28], "intensity": [1.0, 0.5, 0.0]}
@@ -111,9 +111,9 @@ def test_a_lamp_near_its_texels_loses_no_light(floor: Tracer, texels: Atlas, hei
     power, coarse = np.zeros(40), np.zeros(40)
     for seed in seeds:
         rng = np.random.default_rng(seed)
-        places = on_texels(floor, texels, 4, rng)
-        light = mean_irradiance(floor, centred(floor, lighting), places, np.random.default_rng(seed))
-        fine = texel_irradiance(floor, texels, lighting, places, np.random.default_rng(seed))
+        places = Texels.of(floor, texels, 4, rng)
+        light = mean_irradiance(floor, centred(floor, lighting), places.places, np.random.default_rng(seed))
+        fine = places.irradiance(lighting, np.random.default_rng(seed))
         away = np.linalg.norm(texels.position - lighting[0].anchor(), axis=1) > 4 * np.sqrt(texels.area)
         np.testing.assert_array_equal(fine[away], light[away])
         power[seed], coarse[seed] = texels.area @ fine[:, 0].astype(np.float64), texels.area @ light[:, 0].astype(np.float64)
@@ -127,11 +127,22 @@ def test_a_lamp_near_its_texels_loses_no_light(floor: Tracer, texels: Atlas, hei
 
 def test_lamps_far_from_all_texels_cost_nothing(floor: Tracer, texels: Atlas) -> None:
     lighting = parse_lighting([{"type": "point", "position": [0, 1, 0], "intensity": [1, 1, 1]}, SUN])
-    places, rng = on_texels(floor, texels, 4, np.random.default_rng(0)), np.random.default_rng(1)
+    places, rng = Texels.of(floor, texels, 4, np.random.default_rng(0)), np.random.default_rng(1)
     before = floor.rays
-    texel_irradiance(floor, texels, lighting, places, rng)
+    places.irradiance(lighting, rng)
     assert floor.rays - before <= 2 * 4 * texels.count
     assert rng.random() == np.random.default_rng(1).random(), "nothing was drawn"
+
+
+def test_light_of_near_lamps_adds_up(floor: Tracer, texels: Atlas) -> None:
+    """Whatever other lamps there are, and whichever lighting they are in: to the rounding of a sum."""
+    near, far = {**POINT, "position": [0.3, 0.03, 0]}, {**POINT, "position": [-0.5, 0.2, 0.1]}
+    places = Texels.of(floor, texels, 4, np.random.default_rng(0))
+    both, one, other = (
+        places.irradiance(parse_lighting(lamps), np.random.default_rng(seed))
+        for seed, lamps in enumerate(([near, far], [near], [far]))
+    )
+    np.testing.assert_allclose(both, one + other, rtol=2 * np.finfo(np.float32).eps)
 
 
 @pytest.mark.parametrize("each", [1, 4, 7, 64])

@@ -10,8 +10,7 @@ from ddprt.lights import Lighting, parse_lighting
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
 from ddprt.transport import operator
-from ddprt.transport.direct import centred, direct_irradiance, mean_irradiance
-from ddprt.transport.direct import on_texels as places_on
+from ddprt.transport.direct import Texels, centred, direct_irradiance, mean_irradiance
 from ddprt.transport.embree import Tracer
 from ddprt.transport.gather import Receivers, seen_from
 from ddprt.transport.openness import build_open_atlas
@@ -42,7 +41,7 @@ def boxed(scene: Scene, resolution: int, senders: int) -> Box:
     tracer = Tracer.of(scene)
     atlas, _ = build_open_atlas(tracer, scene, resolution)
     ready, lightings = Operator.of(tracer, atlas, senders), [parse_lighting(lamp) for lamp in LAMPS]
-    places, rng = places_on(tracer, atlas, 64, seeds.stream(0, "places")), seeds.stream(0, "lights")
+    places, rng = Texels.of(tracer, atlas, 64, seeds.stream(0, "places")).places, seeds.stream(0, "lights")
     light = [mean_irradiance(tracer, centred(tracer, lighting), places, rng) for lighting in lightings]
     return Box(tracer, atlas, ready, lightings, np.concatenate([ready.averaged(part) for part in light], 1))
 

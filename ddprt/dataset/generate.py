@@ -28,7 +28,7 @@ from ddprt.progress import Progress
 from ddprt.sampling.points import Samples, load_samples, place_samples
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
-from ddprt.transport.direct import on_texels, texel_irradiance
+from ddprt.transport.direct import Texels
 from ddprt.transport.effects import Plan, plan
 from ddprt.transport.embree import Tracer
 from ddprt.transport.measure import measure
@@ -316,10 +316,10 @@ class _Bake:
         if not todo:
             return
         seed = self.config.seed
-        places = on_texels(self.tracer, atlas, self.config.transport.direct_samples, seeds.stream(seed, "texel positions"))
+        texels = Texels.of(self.tracer, atlas, self.config.transport.direct_samples, seeds.stream(seed, "texel positions"))
 
         def work(index: int) -> int:
-            light = texel_irradiance(self.tracer, atlas, dataset.lightings[index], places, seeds.stream(seed, "direct", index))
+            light = texels.irradiance(dataset.lightings[index], seeds.stream(seed, "direct", index))
             store.write_map(self.folder / map_name("direct", index), atlas.image(light))
             measured = measure(
                 self.tracer,

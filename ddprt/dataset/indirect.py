@@ -16,7 +16,7 @@ from ddprt.dataset.store import Dataset, Manifest, map_name, read_map, write_map
 from ddprt.progress import Progress, Stage
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
-from ddprt.transport.direct import on_texels, texel_irradiance
+from ddprt.transport.direct import Texels
 from ddprt.transport.effects import Plan
 from ddprt.transport.embree import Tracer
 
@@ -146,13 +146,13 @@ class IndirectBake:
     def _averaged(self, operator: Any, indices: Sequence[int], half: int) -> Float32[np.ndarray, "senders columns"]:
         """Direct light of all lightings on the senders: as it was baked, or a second time for an independent half."""
         covered, seed, samples = self.dataset.covered, self.config.seed, self.config.transport.direct_samples
-        places = on_texels(self.tracer, self.atlas, samples, seeds.stream(seed, "texel positions", half)) if half else None
+        texels = Texels.of(self.tracer, self.atlas, samples, seeds.stream(seed, "texel positions", half)) if half else None
 
         def work(index: int) -> np.ndarray:
-            if places is None:
+            if texels is None:
                 return operator.averaged(read_map(self.dataset.folder / map_name("direct", index))[covered])
             rng = seeds.stream(seed, "direct", index, half)
-            return operator.averaged(texel_irradiance(self.tracer, self.atlas, self.dataset.lightings[index], places, rng))
+            return operator.averaged(texels.irradiance(self.dataset.lightings[index], rng))
 
         return np.concatenate(list(self.tracer.map(work, indices)), 1)
 

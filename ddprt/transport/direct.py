@@ -55,13 +55,68 @@ class Places:
         return cls(np.ascontiguousarray(rows.reshape(blocks, size, 6).swapaxes(1, 2)), samples, count)
 
 
-def on_texels(
-    tracer: Tracer, atlas: Atlas, samples: int, rng: np.random.Generator, texels: Int[np.ndarray, " texels"] | None = None
+@dataclass(frozen=True, eq=False)
+class Texels:
+    """Places spread over every texel, uniform by area, the same for all lightings so that their light adds up.
+
+    Attributes:
+      tracer: the occluders.
+      atlas: the texels.
+      shift: start of each texel's sequence of places.
+      places: `samples` of each texel.
+    """
+
+    tracer: Tracer
+    atlas: Atlas
+    shift: Float32[np.ndarray, "texels 2"]
+    places: Places
+
+    @classmethod
+    def of(cls, tracer: Tracer, atlas: Atlas, samples: int, rng: np.random.Generator) -> "Texels":
+        """So many places per texel."""
+        shift = rng.random((atlas.count, 2), np.float32)
+        return cls(tracer, atlas, shift, _spread(tracer, atlas, samples, shift, np.arange(atlas.count)))
+
+    def irradiance(self, lighting: Lighting, rng: np.random.Generator) -> Float32[np.ndarray, "texels 3"]:
+        """Mean E of each texel, shadows included.
+
+        A lamp at distance d changes across a texel of width w by some w / d of its light, so texels nearer to it than a few of
+        their widths are looked at again with more places: so many that the error there stays what it is further off.
+
+        Args:
+          lighting: world space.
+          rng: for lights with size.
+        Returns:
+          W/m², as in `mean_irradiance`.
+        """
+        total = np.zeros((self.atlas.count, 3), np.float32)
+        for light, there in zip(lighting, centred(self.tracer, lighting), strict=True):
+            own = mean_irradiance(self.tracer, (there,), self.places, rng)
+            for texels, samples in self._closer(light):
+                closer = _spread(self.tracer, self.atlas, samples, self.shift[texels], texels)
+                own[texels] = mean_irradiance(self.tracer, (there,), closer, rng)
+            with np.errstate(over="ignore", invalid="ignore"):  # see `mean_irradiance`
+                total += own
+        return total
+
+    def _closer(self, light: Light) -> list[tuple[Int[np.ndarray, " near"], int]]:
+        """Texels that need more places for this light, and how many."""
+        lamp = light.anchor()
+        if lamp is None:
+            return []
+        ratio = np.linalg.norm(self.atlas.position - lamp, axis=1) / np.sqrt(self.atlas.area)
+        found = []
+        for low, high, factor in ((0, 1, 256), (1, 4, 16)):
+            texels, samples = np.flatnonzero((ratio >= low) & (ratio < high)), min(factor * self.places.samples, MOST_PLACES)
+            if len(texels) and samples > self.places.samples:
+                found.append((texels, samples))
+        return found
+
+
+def _spread(
+    tracer: Tracer, atlas: Atlas, samples: int, shift: Float32[np.ndarray, "texels 2"], texels: Int[np.ndarray, " texels"]
 ) -> Places:
-    """So many places spread over every texel, or over some, uniform by area."""
-    texels = np.arange(atlas.count) if texels is None else texels
-    shift = rng.random((len(texels), 1, 2), np.float32)
-    u = (shift + _sequence(samples).T).reshape(-1, 2)
+    u = (shift[:, None] + _sequence(samples).T).reshape(-1, 2)
     u -= u >= 1
     position, triangle = atlas.sampler.sample(np.repeat(texels, samples), u)
     return Places.of(tracer, position, tracer.normals[triangle], samples)
@@ -88,36 +143,6 @@ def mean_irradiance(
     for light in lighting:
         words = rng.integers(0, 1 << 64, 0 if light.delta else places.count, np.uint64).view(np.uint32).reshape(-1, 2)
         _add(tracer, light, places, partial(_shifted, words, _sequence(places.samples)), total, shadows)
-    return total
-
-
-def texel_irradiance(
-    tracer: Tracer, atlas: Atlas, lighting: Lighting, places: Places, rng: np.random.Generator
-) -> Float32[np.ndarray, "texels 3"]:
-    """Mean E of each texel, shadows included.
-
-    A lamp at distance d changes across a texel of width w by some w / d of its light, so texels nearer to one than a few of
-    their widths are looked at again with more places: so many that the error there stays what it is further off.
-
-    Args:
-      tracer: the occluders.
-      atlas: the texels.
-      lighting: world space.
-      places: on all texels, from `on_texels`.
-      rng: for lights with size, and for the further places.
-    Returns:
-      W/m², as in `mean_irradiance`.
-    """
-    lights = centred(tracer, lighting)
-    total = mean_irradiance(tracer, lights, places, rng)
-    lamps = [place for light in lighting if (place := light.anchor()) is not None]
-    if lamps:
-        distance = np.min([np.linalg.norm(atlas.position - lamp, axis=1) for lamp in lamps], 0)
-        ratio = distance / np.sqrt(atlas.area)
-        for low, high, factor in ((0, 1, 256), (1, 4, 16)):
-            texels, samples = np.flatnonzero((ratio >= low) & (ratio < high)), min(factor * places.samples, MOST_PLACES)
-            if len(texels) and samples > places.samples:
-                total[texels] = mean_irradiance(tracer, lights, on_texels(tracer, atlas, samples, rng, texels), rng)
     return total
 
 
