@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import oracles
 from hard_arrays import POINTS, TEST, TEXELS, TRAIN, VALIDATION, WITHIN, relit, room
-from hard_cases import HardCase, Outcome
+from hard_cases import REFUSED, HardCase, Outcome
 from oracles import U32, over_bound
 
 from ddprt.fitting.basis import fit_basis
@@ -137,4 +137,5 @@ CASES: tuple[HardCase, ...] = (
         frozenset({"rank_deficient"}),
         slow=True,
     ),
+    HardCase("all areas 0", "their sum divides", "refused", relit(room, area=np.zeros(TEXELS), says="area"), REFUSED),
 )

@@ -1,6 +1,7 @@
 """Light of all sizes and signs: either end of float32, decades in one map, gamma and noise, foreign lightings."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -112,7 +113,29 @@ _NOISE = np.where(
 )
 
 
+def _energy_over_areas(factor: float) -> Outcome:
+    """Areas have no unit in the energy clamp: times a power of two the same map, but for n roundings of the areas' sum."""
+    measured, indirect = room()
+    area = np.linspace(1, 2, TEXELS).astype(np.float32)
+    probes = (np.eye(10)[:TEST, :, None] + np.full(3, 1e-3)).astype(np.float32)
+    plain, other = (
+        ddprt.fit(make_data(measured, indirect, part), bases=BASES, ridge=1e-3).predict(probes, clamp="energy").astype(float)
+        for part in (area, area * np.float32(factor))
+    )
+    worst = over_bound(other - plain, rounding(8 * TEXELS, U32) * np.abs(plain).max())
+    return Outcome(worst, "ok", bool(np.isfinite(other).all()))
+
+
 CASES: tuple[HardCase, ...] = (
+    *(
+        HardCase(
+            f"energy clamp over areas of {factor:g}",
+            "their sum overflows, or is flushed to 0",
+            "as over areas of 1",
+            partial(_energy_over_areas, factor),
+        )
+        for factor in (2.0**125, 2.0**-133)
+    ),
     HardCase("one light 1e6 times brighter", "errors in W/m² are those of one lighting", WITHIN, relit(changed(one_bright))),
     HardCase("intensities 1e-30", "squares underflow float32", WITHIN, relit(changed(times(1e-30)))),
     HardCase("intensities 1e30", "squares overflow float32", WITHIN, relit(changed(times(1e30)))),

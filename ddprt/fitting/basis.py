@@ -195,5 +195,5 @@ def _over_tiles(add: Callable[..., Any], total: Any, *arrays: Array | None) -> A
 
 def entry_weights(area: np.ndarray, weights: Literal["area", "texel"], channels: Literal["mono", "multi"]) -> np.ndarray:
     """Weights of the entries of a column, summing to 1: one per texel, or per texel and channel when colours interleave."""
-    per_texel = area / area.sum() if weights == "area" else np.full(len(area), 1 / len(area))
+    per_texel = area / area.sum(dtype=np.float64) if weights == "area" else np.full(len(area), 1 / len(area))
     return (np.repeat(per_texel / 3, 3) if channels == "multi" else per_texel).astype(np.float32)

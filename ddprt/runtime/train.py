@@ -120,7 +120,7 @@ def _judged(relighter: Relighter, encoding: Encoding, train: Examples, validatio
     """The laws that a method beats mean lightmap and black on its validation set and was trained on its kind, or says not."""
     mean = MeanLightmap().fit(train, validation, key=jax.random.key(0))
     frame = validation.frame
-    area = jnp.asarray(validation.area / validation.area.sum(), jnp.float32)
+    area = jnp.asarray(validation.area / validation.area.sum(dtype=np.float64), jnp.float32)
     data = frame.values, frame.positions, frame.normals, validation.indirect, validation.scale, area
     lightings = None if frame.lightings is None else tuple(frame.lightings)
     ours, floor, whole = (np.asarray(_squares(one, encoding, *data, lightings), np.float64) for one in (relighter, mean, None))
