@@ -13,6 +13,7 @@ from oracles import TINY32, U32, U64, over_bound, rounding
 from ddprt.config import FitConfig
 from ddprt.dataset.store import Dataset
 from ddprt.fitting.basis import RANK_CUT, entry_weights
+from ddprt.fitting.selection import REPEATS
 from ddprt.fitting.transfer import Transfer
 from ddprt.runtime.model import Model
 from ddprt.runtime.train import examples
@@ -160,14 +161,20 @@ def judge_fit(fit: Transfer, X: np.ndarray, C: np.ndarray, ridge: Any, intercept
     return judge_transfer(X.astype(float), C.astype(float), np.zeros(C.shape), ridge, parts, intercept)
 
 
+def left_with(X: np.ndarray, row: int) -> np.ndarray:
+    """Which rows are left out with one: those within a hundredth of their size."""
+    return ((X - X[row]) ** 2).sum(1) <= REPEATS**2 / 2 * ((X**2).sum(1) + (X[row] ** 2).sum())
+
+
 def bound_left_out(X: np.ndarray, C: np.ndarray, ridge: float, intercept: bool) -> float:
-    """Error of a leave-one-out residual e / (1 - h), closed form or refits by a float64 SVD.
+    """Error of a leave-one-out residual (Id - H)_rows^-1 e_rows, closed form or refits by a float64 SVD.
 
     With t = sigma_1 / sqrt(ridge), H = X G X^T moves by 2 ||dX|| ||X G|| <= p u64 t, a residual by that times ||C||, and a
-    quotient by 1 / (1 - h)² at most. A refit's matrix moves by ||dX|| ||C|| / ridge, its prediction by sigma_1 times
-    that: p u64 t² ||C||.
+    quotient by the squared norm of (Id - H)_rows^-1 at most, 1 / (1 - h)² for a single row. A refit's matrix moves by
+    ||dX|| ||C|| / ridge, its prediction by sigma_1 times that: p u64 t² ||C||.
     """
     left, S, _ = np.linalg.svd(X - X.mean(0) * intercept, full_matrices=False)
-    free = 1 - intercept / len(X) - float((left**2 * (S**2 / (S**2 + ridge))).sum(1).max())
+    rest = np.eye(len(X)) - intercept / len(X) - (left * (S**2 / (S**2 + ridge))) @ left.T
+    free = min(float(np.linalg.eigvalsh(rest[np.ix_(rows, rows)])[0]) for rows in (left_with(X, row) for row in range(len(X))))
     t = S[0] / np.sqrt(ridge)
     return rounding(2 * sum(X.shape), U64) * (t + t**2 + 1) * float(np.linalg.norm(C)) / free**2
