@@ -134,10 +134,10 @@ def test_a_bake_that_was_stopped(
     """Among the direct maps or the indirect ones, and gone on with by another number of threads."""
     steps, advance = iter(range(stop)), Stage.advance
 
-    def stopped(stage: Stage, *arguments: Any) -> None:
+    def stopped(stage: Stage, *arguments: Any, **named: Any) -> None:
         if next(steps, None) is None:
             raise KeyboardInterrupt
-        advance(stage, *arguments)
+        advance(stage, *arguments, **named)
 
     with monkeypatch.context() as patch:
         patch.setattr(Stage, "advance", stopped)
