@@ -372,7 +372,7 @@ def draw_bars(found: dict[str, tuple[dict[str, np.ndarray], np.ndarray]]) -> Non
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, rows = plt.subplots(len(found), 3, figsize=(12, 4.6 * len(found)), sharey="row", layout="constrained")
+    figure, rows = plt.subplots(len(found), 3, figsize=(12, 6.6 * len(found)), sharey="row", layout="constrained")
     for axes, (scenario, (errors, floor)) in zip(np.atleast_2d(rows), found.items(), strict=True):
         for axis, name, column in zip(axes, FIGURES, range(3), strict=True):
             heights = [error[column] for error in errors.values()]
