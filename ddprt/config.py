@@ -139,7 +139,7 @@ class TransportConfig(Section):
     )
     denoise: bool = Field(False, description="train and validation: filter maps by Open Image Denoise (extra denoise)")
     adaptive: bool = Field(True, description="train and validation: more rays where footprints are small and light varies")
-    direct_samples: int = Field(4, ge=1, le=1024, description="shadow rays per texel and light")
+    direct_samples: int = Field(4, ge=1, le=1024, description="shadow rays per texel and light; more near lamps")
     sender_resolution: int = Field(
         0,
         ge=0,

@@ -1,5 +1,6 @@
 """Files that are whole or absent: temporary name, fsync, rename; folders that one process at a time writes to."""
 
+import hashlib
 import os
 import re
 from collections.abc import Iterator
@@ -148,3 +149,16 @@ def read_tensors(path: Path) -> dict[str, np.ndarray]:
         return load_file(path)
     except (OSError, SafetensorError) as error:
         raise UserError(f"{path}: not a whole tensor file ({error}); make it again") from None
+
+
+def sha256(path: Path) -> str:
+    """Hash of a file's contents, in hexadecimal.
+
+    Raises:
+      UserError: it cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror or error}); mend the folder's permissions") from None

@@ -5,7 +5,6 @@ A file is written under a temporary name, synced and renamed; then its line (nam
 goes on from there.
 """
 
-import hashlib
 import json
 import os
 from collections.abc import Iterable, Sequence
@@ -19,7 +18,7 @@ import numpy as np
 
 from ddprt.axes import Bool, Float32, Float64
 from ddprt.errors import UserError
-from ddprt.files import make_folder, read_tensors, write_text
+from ddprt.files import make_folder, read_tensors, sha256, write_text
 from ddprt.lights import Lighting, parse_lighting
 from ddprt.sampling.points import Samples
 from ddprt.scene.atlas import Atlas
@@ -218,7 +217,7 @@ class Manifest:
     def add(self, name: str) -> None:
         """Names a file that has just been moved into place; naming the same contents again adds nothing."""
         path = self.folder / name
-        entry = {"file": name, "bytes": path.stat().st_size, "sha256": _sha256(path)}
+        entry = {"file": name, "bytes": path.stat().st_size, "sha256": sha256(path)}
         if self.entries.get(name) == entry:
             return
         line = (json.dumps(entry) + "\n").encode()
@@ -242,7 +241,7 @@ class Manifest:
 
     def fits(self, name: str) -> bool:
         """Whether the contents of a named file are those of its hash."""
-        return bool(_sha256(self.folder / name) == self.entries[name]["sha256"])
+        return bool(sha256(self.folder / name) == self.entries[name]["sha256"])
 
     def lacks(self, kinds: Sequence[str], indices: Iterable[int]) -> list[int]:
         """The lightings that some kind of map is still missing of."""
@@ -320,8 +319,3 @@ def _refuse_odd(path: Path, values: np.ndarray, *, signed: bool = False) -> None
     if values.size and not (np.isfinite(values).all() and (signed or values.min() >= 0)):
         got = "NaN or infinity" if not np.isfinite(values).all() else f"negative values (down to {values.min():.3g})"
         raise UserError(f"{path}: got {got}, expected finite values, 0 or more; bake it again or mend its source")
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

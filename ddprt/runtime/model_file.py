@@ -4,7 +4,6 @@ model.json carries the SHA-256 of the tensors, so that a damaged model is refuse
 that wrote none are told by its absence; of theirs it is known only that all numbers are finite and in range.
 """
 
-import hashlib
 import json
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -16,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from ddprt import __version__
 from ddprt.errors import UserError
-from ddprt.files import read_tensors, write_tensors, write_text
+from ddprt.files import read_tensors, sha256, write_tensors, write_text
 from ddprt.fitting.encoding import Encoding
 from ddprt.methods import METHODS
 from ddprt.methods.method import FitReport
@@ -116,7 +115,7 @@ def save_model(model: Model, folder: Path) -> None:
         "report": asdict(model.relighter.report),
         "trust": trust or None,
         "unit": "W/m2",
-        "tensors_sha256": _sha256(folder / "tensors.safetensors"),
+        "tensors_sha256": sha256(folder / "tensors.safetensors"),
     }
     write_text(folder / "model.json", json.dumps(document, indent=1) + "\n")
 
@@ -141,7 +140,7 @@ def load_model(folder: str | Path) -> Model:
     try:
         relighter_type = METHODS[document["method"]].relighter
         checked = _Document.model_validate(document)
-        if checked.tensors_sha256 not in (None, _sha256(folder / "tensors.safetensors")):
+        if checked.tensors_sha256 not in (None, sha256(folder / "tensors.safetensors")):
             raise ValueError("the tensors are not those that were saved: their checksum is another")
         odd = [name for name, array in tensors.items() if not np.isfinite(array).all()]
         if odd:
@@ -202,11 +201,3 @@ def _assemble(document: dict[str, Any], checked: _Document, tensors: dict[str, n
 def _yardstick(numbers: _Trust, tensors: dict[str, np.ndarray]) -> Yardstick:
     directions, shares, mean = (tensors[f"trust.{name}"] for name in ("directions", "shares", "mean"))
     return Yardstick(directions, shares, mean, **numbers.model_dump())
-
-
-def _sha256(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror or error}); mend the folder's permissions") from None
