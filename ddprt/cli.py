@@ -36,6 +36,10 @@ class Call:
         """Whether progress is hidden."""
         return "quiet" in self.options
 
+    def asks(self, flag: str) -> bool:
+        """Whether a flag was given."""
+        return flag in self.options
+
     def file(self, what: str) -> str:
         """The one file argument."""
         if len(self.files) != 1:
@@ -190,11 +194,12 @@ def doctor(call: Call) -> None:
 
 @dataclass(frozen=True)
 class Verb:
-    """One verb: its code, what it works on, its own options, and whether it takes --section.key overrides."""
+    """One verb: its code, what it works on, its own options and flags, and whether it takes --section.key overrides."""
 
     work: Callable[[Call], None]
     file: str = "FILE.toml"
     options: dict[str, str] = field(default_factory=dict)
+    flags: dict[str, str] = field(default_factory=dict)
     configured: bool = True
 
 
@@ -307,7 +312,7 @@ def parse(name: str, words: list[str]) -> Call:
             call.files.append(word)
             continue
         key, given, value = word[2:].partition("=")
-        if key in FLAGS and not given:
+        if key in {**verb.flags, **FLAGS} and not given:
             call.options[key] = ""
             continue
         known = key in verb.options or (verb.configured and ("." in key or key == "seed"))
@@ -316,7 +321,7 @@ def parse(name: str, words: list[str]) -> Call:
 
             check_key(key, name)
         if not known:
-            choices = [*verb.options, *FLAGS]
+            choices = [*verb.options, *verb.flags, *FLAGS]
             if verb.configured:
                 from ddprt.config import keys
 
@@ -336,7 +341,7 @@ def parse(name: str, words: list[str]) -> Call:
 
 def _help(name: str) -> None:
     verb = VERBS[name]
-    rows = [f"  --{key} {text}" for key, text in {**verb.options, **FLAGS}.items()]
+    rows = [f"  --{key} {text}" for key, text in {**verb.options, **verb.flags, **FLAGS}.items()]
     usage = f"ddprt {name} {verb.file}".rstrip()
     print(f"{usage}: {verb.work.__doc__}\n\noptions:\n" + "\n".join(rows))
     if verb.configured:
@@ -346,4 +351,6 @@ def _help(name: str) -> None:
 
         print("\nsettings (in the file as [section] key = value, here as --section.key value):")
         print("  --methods.settings.NAME '{key = value}'  settings of one method")
+        print("  --sweep.SECTION.KEY '[value, value]'     what `ddprt bench` tries of a setting")
+        print("  --budget.scenario.KEY VALUE              a setting of [lightings] that held-out ones differ in")
         tyro.cli(Config, args=["--help"], prog=usage, add_help=True, config=(tyro.conf.FlagConversionOff,))

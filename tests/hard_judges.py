@@ -10,13 +10,13 @@ import numpy as np
 import oracles
 from oracles import TINY32, U32, U64, over_bound, rounding
 
-from ddprt.config import FitConfig
 from ddprt.dataset.store import Dataset
 from ddprt.fitting.basis import RANK_CUT, entry_weights
 from ddprt.fitting.selection import REPEATS
 from ddprt.fitting.transfer import Transfer
 from ddprt.runtime.model import Model
 from ddprt.runtime.train import examples
+from ddprt.sections import FitConfig
 
 
 def judge(data: Dataset, model: Model, probes: np.ndarray | None = None) -> float:

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ddprt.config import TransportConfig
 from ddprt.lights import parse_lighting
 from ddprt.scene.atlas import Atlas, Senders, build_atlas
 from ddprt.scene.checks import checked
 from ddprt.scene.library import build
 from ddprt.scene.mesh import Scene
+from ddprt.sections import TransportConfig
 from ddprt.transport import effort, operator
 from ddprt.transport.effort import Choice, allot, choose_rays
 from ddprt.transport.embree import Tracer

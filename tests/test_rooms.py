@@ -10,6 +10,7 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "ddprt"
 GROUND = {"errors", "axes", "catalogue", "compiled", "seeds", "warp", "files", "progress", "machine"}
 WALK = [
+    "sections",
     "config",
     "scene",
     "lights",
@@ -21,6 +22,7 @@ WALK = [
     "runtime",
     "report",
     "export",
+    "bench",
     "pipeline",
     "pipeline_inspect",
     "cli",

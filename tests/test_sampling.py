@@ -10,7 +10,6 @@ import oracles
 import pytest
 from scipy.spatial import cKDTree
 
-from ddprt.config import LightingsConfig
 from ddprt.errors import UserError
 from ddprt.lights import Lighting, lighting_json
 from ddprt.sampling.lightings import Draw, draw_lightings
@@ -20,6 +19,7 @@ from ddprt.scene.checks import checked
 from ddprt.scene.library import build
 from ddprt.scene.mesh import Material, Scene
 from ddprt.scene.shapes import box, faceted
+from ddprt.sections import LightingsConfig
 from ddprt.transport.embree import Tracer
 from ddprt.transport.openness import build_open_atlas
 

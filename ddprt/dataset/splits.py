@@ -4,12 +4,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ddprt.config import LightingsConfig
 from ddprt.errors import UserError
 from ddprt.lights import Lighting, lighting_json, load_lightings, parse_lighting
 from ddprt.sampling.lightings import draw_lightings
 from ddprt.scene.distance import distance_within
 from ddprt.scene.mesh import Scene
+from ddprt.sections import LightingsConfig
 from ddprt.transport.embree import Tracer
 
 SPLITS = ("train", "validation", "test")

@@ -12,7 +12,7 @@ from jaxtyping import Array
 from threadpoolctl import threadpool_limits
 
 from ddprt import seeds
-from ddprt.config import Config, FitConfig
+from ddprt.config import Config
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.fitting.encoding import Encoding
@@ -23,6 +23,7 @@ from ddprt.methods.method import Examples, Frame, Relighter, unseen_share
 from ddprt.methods.statuses import BLIND
 from ddprt.runtime.model import Model
 from ddprt.runtime.trust import Yardstick, calibrated, make_yardstick, outside
+from ddprt.sections import FitConfig
 
 ROUNDING = 1e-6
 """Relative error that float32 makes by itself: an eps for each of some 16 bases, with random signs and room for more."""

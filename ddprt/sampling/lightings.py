@@ -11,10 +11,10 @@ import numpy as np
 
 from ddprt import seeds, warp
 from ddprt.axes import Float64
-from ddprt.config import LightingsConfig
 from ddprt.errors import UserError
 from ddprt.lights import LIGHTS, Light, Lighting
 from ddprt.lights.light import unit
+from ddprt.sections import LightingsConfig
 
 Clearance = Callable[[Float64[np.ndarray, "n 3"]], Float64[np.ndarray, " n"]]
 """Free radius about positions, metres; 0 inside a solid."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from ddprt import seeds
 from ddprt.axes import Float32, Float64, Int
-from ddprt.config import TransportConfig
+from ddprt.sections import TransportConfig
 from ddprt.transport.footprint import Footprints, find_footprints
 from ddprt.transport.near import NearField, columns_of
 from ddprt.transport.operator import Operator
