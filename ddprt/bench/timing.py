@@ -66,9 +66,9 @@ def timed(work: Callable[[], T], repeats: int) -> tuple[T, Timing]:
 _spent = [0.0]
 
 
-def _note(event: str, seconds: float, **_: Any) -> None:
+def _note(event: str, duration_secs: float, **_: Any) -> None:
     if event in _COMPILING:
-        _spent[0] += seconds
+        _spent[0] += duration_secs
 
 
 jax.monitoring.register_event_duration_secs_listener(_note)
