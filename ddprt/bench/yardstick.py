@@ -175,6 +175,7 @@ class Yardstick:
         if basis is None:
             return None
         vectors, texels = np.asarray(basis, np.float64), len(model.area)
+        vectors = vectors[vectors.any(1)]  # one that is cut short keeps its shape
         mean = np.asarray(getattr(model.relighter, "mean", 0.0), np.float64)
         values = self.measured(model)
 
