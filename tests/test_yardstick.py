@@ -285,14 +285,15 @@ def test_a_coarser_lightmap_is_scored_as_well(yardstick: Yardstick, models: dict
 
 def test_fewer_bases_score_worse(yardstick: Yardstick, models: dict[str, Model]) -> None:
     whole = models["svd-ridge"]
-    shorter = [replace(whole, relighter=whole.relighter.truncated(bases)) for bases in (8, 3, 1)]  # type: ignore[attr-defined]
+    shorter = [replace(whole, relighter=whole.relighter.truncated(bases)) for bases in (8, 3, 1, 0)]  # type: ignore[attr-defined]
     scores, floors = [yardstick.score(model) for model in shorter], [yardstick.projection(model) for model in shorter]
     for key in ("relative_rmse", "relative_mse", "median_lighting_relative_rmse"):
-        assert scores[0][key] < scores[1][key] < scores[2][key]
+        assert scores[0][key] < scores[1][key] < scores[2][key] < scores[3][key]
     for key in ("psnr_db", "pu21_psnr_db"):
-        assert scores[0][key] > scores[1][key] > scores[2][key]
-    assert floors[0] < floors[1] < floors[2]
-    assert all(floor < score["relative_rmse"] for floor, score in zip(floors, scores, strict=True))
+        assert scores[0][key] > scores[1][key] > scores[2][key] > scores[3][key]
+    assert floors[0] < floors[1] < floors[2] < floors[3]
+    assert all(floor < score["relative_rmse"] for floor, score in zip(floors[:3], scores, strict=False))
+    assert floors[3] == scores[3]["relative_rmse"], "without a basis all is black"
 
 
 def test_a_model_that_sees_nothing_is_told(yardstick: Yardstick, models: dict[str, Model]) -> None:

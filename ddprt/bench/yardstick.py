@@ -182,7 +182,7 @@ class Yardstick:
         def over(entries: Float64[np.ndarray, "rows entries"]) -> Float64[np.ndarray, "rows others"]:
             return self._carry(model, entries.reshape(len(entries), texels, -1)).reshape(len(entries), -1)
 
-        vectors = over(vectors)
+        vectors = over(vectors) if len(vectors) else vectors
         mean = over(mean.reshape(1, -1))[0] if mean.size > 1 else mean
 
         def differences() -> Iterator[Maps]:
