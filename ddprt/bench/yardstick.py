@@ -107,8 +107,8 @@ class Yardstick:
     data: Dataset
     frames: int = 0
     pictures: int = 0
-    _measured: dict[tuple[str, float, int, str], np.ndarray] = field(default_factory=dict, repr=False)
-    _carried: dict[tuple[int, ...], csr_matrix] = field(default_factory=dict, repr=False)
+    _measured: dict[tuple[str, float, int, str], np.ndarray] = field(default_factory=dict, init=False, repr=False)
+    _carried: dict[tuple[int, ...], csr_matrix] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def held_out(self) -> list[int]:
