@@ -17,6 +17,7 @@ from ddprt.errors import UserError
 from ddprt.progress import Progress
 from ddprt.report.evaluate import evaluate
 from ddprt.report.metrics import Truth
+from ddprt.report.view import look_up
 from ddprt.runtime.model import Model
 from ddprt.runtime.train import fit_config
 from ddprt.scene.atlas import Atlas, build_atlas
@@ -207,6 +208,16 @@ def atlases(plates: Scene) -> dict[int, Atlas]:
 
 
 PAIRS = [(32, 64), (64, 32), (47, 64), (64, 47)]
+
+
+def test_missing_texels_leave_their_weight_to_the_others() -> None:
+    covered = np.array([[True, True], [True, False]])
+    # A quarter of a texel right of and below the middle of the first: 9, 3, 3 and 1 sixteenths; and that middle itself.
+    place, share = np.array([[0.375, 0.375], [0.25, 0.25]]), np.array([1.0, 0.5])
+    matrix = look_up(place, np.array([0, 1]), share, 2, covered).toarray()
+    # What is missing keeps a millionth, so that a place with nothing about it finds something.
+    np.testing.assert_allclose(matrix, [[9 / 15, 3 / 15, 3 / 15], [0.5, 0, 0]], atol=2e-6)
+    np.testing.assert_allclose(matrix.sum(1), share, rtol=4 * EPS)
 
 
 @pytest.mark.parametrize(("coarse", "fine"), PAIRS)
