@@ -7,15 +7,15 @@ does hits them alike.
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from importlib.util import find_spec
+from dataclasses import dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
 import jax
 import numpy as np
 
-from ddprt.bench.timing import Timing, compiling
+from ddprt.bench.timing import Timing, compiling, peak_memory
 
 OURS = "ddprt"
 _PATIENCE = 60.0  # seconds after which no further turn begins
@@ -37,7 +37,7 @@ class Peer:
     """
 
     name: str
-    prepare: Callable[[Any], Callable[[], Any]]
+    prepare: Callable[..., Callable[[], Any]]
     needs: str = ""
     package: str = ""
     remark: str = ""
@@ -49,10 +49,10 @@ class Peer:
         if not self.needs:
             return ""
         try:
-            found = find_spec(self.needs)
-        except (ImportError, ValueError):
-            found = None
-        return "" if found else f'{self.needs} is not installed; pip install "ddprt[peers]", or {self.package or self.needs} alone'
+            import_module(self.needs)
+        except ImportError as error:
+            return f"{self.needs} is not installed ({error}); pip install {self.package or self.needs}"
+        return ""
 
 
 @dataclass(frozen=True)
@@ -93,18 +93,14 @@ def verdict(errors: Mapping[str, float], ours: Mapping[str, float], blur: Mappin
     return "equal or better" if within else "less accurate"
 
 
-def in_turn(works: Mapping[str, Callable[[], Any]], repeats: int) -> tuple[dict[str, Any], dict[str, Timing]]:
-    """Results and seconds of several works that take turns; the first turn compiles and is not counted.
+def in_turn(works: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, list[float]]:
+    """Seconds of several works that take turns, compiled before.
 
     Args:
       works: without side effects; what they return is waited for.
-      repeats: turns that count, at least 1; fewer where they take longer than a minute.
+      repeats: turns, at least 1; fewer where they take longer than a minute.
     """
-    results, spent, seconds = {}, {}, {name: list[float]() for name in works}
-    for name, work in works.items():
-        with compiling() as found:
-            results[name] = jax.block_until_ready(work())
-        spent[name] = found[0]
+    seconds: dict[str, list[float]] = {name: [] for name in works}
     begun = time.perf_counter()
     for turn in range(repeats):
         if turn and time.perf_counter() - begun > _PATIENCE:
@@ -113,11 +109,7 @@ def in_turn(works: Mapping[str, Callable[[], Any]], repeats: int) -> tuple[dict[
             start = time.perf_counter()
             jax.block_until_ready(work())
             seconds[name].append(time.perf_counter() - start)
-    timings = {}
-    for name, found in seconds.items():
-        low, median, high = np.quantile(found, [0.25, 0.5, 0.75])
-        timings[name] = Timing(float(median), float(low), float(high), spent[name], len(found))
-    return results, timings
+    return seconds
 
 
 def compare(
@@ -127,10 +119,11 @@ def compare(
     blur: Mapping[str, float],
     *,
     repeats: int,
+    frames: int = 1,
     piece: Any = None,
     times: float = 1.0,
     limit: float = np.inf,
-    progress: Callable[[str], None] = lambda line: None,
+    tell: Callable[[str], None] = lambda line: None,
 ) -> list[Row]:
     """Rows of a comparison: ours first, then the accurate ones by time, the less accurate ones, yardsticks, those skipped.
 
@@ -140,39 +133,64 @@ def compare(
       judge: errors of a result.
       blur: what rounding alone does to each error; differences below it tell nothing.
       repeats: turns.
+      frames: how many problems a work solves; seconds are of one.
       piece: a smaller problem to try everyone on first; None tries nobody.
       times: how much more work `whole` is than `piece`.
       limit: seconds that a run of `whole` may be expected to take.
-      progress: is told who is at work.
+      tell: is told who is at work.
     """
     works: dict[str, Callable[[], Any]] = {}
-    skipped = {peer.name: peer.missing for peer in peers if peer.missing}
+    errors: dict[str, dict[str, float]] = {}
+    spent, skipped = {}, {peer.name: peer.missing for peer in peers if peer.missing}
     for peer in peers:
         if peer.name in skipped:
             continue
-        progress(peer.name)
+        tell(peer.name)
         reason = "" if piece is None or peer.name == OURS else _too_much(peer.prepare(piece), times, limit)
         if reason:
             skipped[peer.name] = reason
-        else:
-            works[peer.name] = peer.prepare(whole)
-    progress("all in turn")
-    results, timings = in_turn(works, repeats)
-    ours = judge(results[OURS])
-    rows = []
+            continue
+        works[peer.name] = peer.prepare(whole)
+        with compiling() as found:
+            result = jax.block_until_ready(works[peer.name]())
+        spent[peer.name] = found[0]
+        errors[peer.name] = {} if peer.yardstick else judge(result)
+        del result  # it may be gigabytes
+    tell("all in turn")
+    timings = {name: _timing(np.array(found) / frames, spent[name]) for name, found in in_turn(works, repeats).items()}
+    rows = [Row(name, "skipped", reason=reason) for name, reason in skipped.items()]
     for peer in peers:
-        if peer.name in skipped:
-            rows.append(Row(peer.name, "skipped", reason=skipped[peer.name]))
-            continue
-        ratio, seconds = timings[peer.name].median / timings[OURS].median, timings[peer.name]
-        if peer.yardstick:
-            rows.append(Row(peer.name, "yardstick", ratio, seconds, reason=peer.remark))
-            continue
-        errors = ours if peer.name == OURS else judge(results[peer.name])
-        mark: Verdict = "ours" if peer.name == OURS else verdict(errors, ours, blur)
-        rows.append(Row(peer.name, mark, ratio, seconds, errors, peer.remark))
+        if peer.name in works:
+            mark: Verdict = "ours" if peer.name == OURS else "yardstick" if peer.yardstick else "less accurate"
+            if mark == "less accurate":
+                mark = verdict(errors[peer.name], errors[OURS], blur)
+            timing = timings[peer.name]
+            rows.append(Row(peer.name, mark, timing.median / timings[OURS].median, timing, errors[peer.name], peer.remark))
     order = ("ours", "equal or better", "less accurate", "yardstick", "skipped")
     return sorted(rows, key=lambda row: (order.index(row.verdict), row.ratio or 0))
+
+
+def _timing(seconds: np.ndarray, compile: float) -> Timing:
+    low, median, high = np.quantile(seconds, [0.25, 0.5, 0.75])
+    return Timing(float(median), float(low), float(high), compile, len(seconds))
+
+
+def enough(peer: Peer, efforts: Sequence[float], word: str, problem: Any, ours: Mapping[str, float]) -> Peer:
+    """A peer that iterates, at the first effort that makes it as accurate as we are; at the last one where none does.
+
+    Args:
+      peer: its `prepare` takes the problem and the effort.
+      efforts: from the cheapest on.
+      word: what efforts are counted in, for the name.
+      problem: has `judge` and `blur`; a piece of the problem will do.
+      ours: our errors on it.
+    """
+    if peer.missing:
+        return peer
+    for effort in efforts:
+        if verdict(problem.judge(peer.prepare(problem, effort)()), ours, problem.blur) == "equal or better":
+            break
+    return replace(peer, name=f"{peer.name}, {effort:g} {word}", prepare=lambda problem: peer.prepare(problem, effort))
 
 
 def best(rows: Sequence[Row]) -> Row | None:
@@ -182,20 +200,23 @@ def best(rows: Sequence[Row]) -> Row | None:
 
 
 def _too_much(work: Callable[[], Any], times: float, limit: float) -> str:
-    """Why the whole is not tried, from a run of the piece; empty where it is."""
-    work()
+    """Why the whole is not tried, from runs of the piece; empty where it is."""
+    with peak_memory() as memory:
+        work()
     start = time.perf_counter()
     work()
-    seconds = (time.perf_counter() - start) * times
+    seconds, needed, held = (time.perf_counter() - start) * times, (memory[0] or 0) * times, _available_gib()
     if seconds > limit:
         return f"1/{times:g} of the problem says that a run takes {seconds:.0f} s, more than the {limit:.0f} s that it may"
+    if needed > held:
+        return f"1/{times:g} of the problem says that it needs {needed:.1f} GiB, more than the {held:.1f} GiB that are free"
     return ""
 
 
-def available_memory() -> float:
-    """Bytes that the system could still give; infinity where it does not tell."""
+def _available_gib() -> float:
+    """Memory that the system could still give; infinity where it does not tell."""
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
-        return next(1024.0 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
+        return next(int(line.split()[1]) / 2**20 for line in lines if line.startswith("MemAvailable:"))
     except (OSError, StopIteration):
         return np.inf
