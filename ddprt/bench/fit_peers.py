@@ -18,16 +18,18 @@ import scipy.linalg
 from jaxtyping import Float
 
 from ddprt import seeds
-from ddprt.bench.standing import OURS, Peer, Row, compare, enough
+from ddprt.bench.standing import OURS, Peer, Row, compare
 from ddprt.config import Config, checked
 from ddprt.dataset.generate import bake
 from ddprt.fitting.basis import fit_basis
+from ddprt.progress import Progress
 from ddprt.scene.files import load_scene
 
 EPS = 2.0**-24
 """Largest relative error of rounding to float32."""
 _TILE = 1 << 14
 _ITERATIONS = (2, 4, 8, 16, 32)
+_TIMES = "iterations"
 _MORE = 10  # vectors that randomised solvers carry beyond those asked for, scikit-learn's default
 
 Solution = tuple[np.ndarray, np.ndarray]
@@ -54,7 +56,7 @@ class Maps:
     @cached_property
     def exact(self) -> tuple[np.ndarray, np.ndarray]:
         """All singular values, and the leading right vectors, in float64."""
-        R = np.zeros((0, len(self.columns)))
+        R: Any = np.zeros((0, len(self.columns)))
         for start in range(0, self.columns.shape[1], _TILE):
             tile = self.columns[:, start : start + _TILE].T.astype(np.float64)
             R = np.linalg.qr(np.concatenate([R, tile]), mode="r")
@@ -87,7 +89,7 @@ class Maps:
         return {"sine of angle": float(sine), "singular values": float(values)}
 
 
-def real_spectrum(config: Config, columns: int) -> np.ndarray:
+def real_spectrum(config: Config, columns: int, progress: Progress) -> np.ndarray:
     """Singular values of a small bake of the configured scene, maps scaled to norm 1, drawn out to so many columns.
 
     The bake has a third as many lightings as there are columns, 48² texels and 64 rays per texel: its tail is noise, as any
@@ -98,7 +100,7 @@ def real_spectrum(config: Config, columns: int) -> np.ndarray:
     plain["lightings"] |= {"train": max(2, columns // 3), "validation": 1, "test": 1, "choose": "random"}
     plain["transport"] |= {"samples": 64, "test_samples": 2, "integrator": "operator"}
     plain["points"] |= {"count": 16, "supersample": 1, "choose": "blue-noise"}
-    data = bake(load_scene(config.scene.name, **config.scene.parameters), config=checked(plain))
+    data = bake(load_scene(config.scene.name, **config.scene.parameters), config=checked(plain), progress=progress)
     maps = data.maps("indirect", data.split("train")).astype(np.float64)
     rows = np.moveaxis(maps, 2, 1).reshape(-1, maps.shape[1])
     norms = np.linalg.norm(rows, axis=1)
@@ -115,20 +117,20 @@ def make_columns(spectrum: np.ndarray, texels: int, seed: int) -> Float[np.ndarr
     columns = np.empty((n, texels), np.float32)
     for start, stop in pairwise([*range(0, texels, _TILE), texels]):
         columns[:, start:stop] = mix @ seeds.stream(seed, "peers right", start).standard_normal((n, stop - start), np.float32)
-    columns -= columns.mean(1, keepdims=True, dtype=np.float64).astype(np.float32)
-    return columns
+    return centred(columns)
 
 
-def fit_rows(
-    maps: Maps, *, repeats: int, limit: float, share: int = 10, tell: Callable[[str], None] = lambda line: None
-) -> list[Row]:
+def centred(columns: Float[np.ndarray, "columns texels"]) -> Float[np.ndarray, "columns texels"]:
+    """The columns less their means over the texels."""
+    return columns - columns.mean(1, keepdims=True, dtype=np.float64).astype(np.float32)
+
+
+def fit_rows(maps: Maps, *, repeats: int, limit: float, share: int = 10, tell: Callable[[], None] = lambda: None) -> list[Row]:
     """Everyone's basis of the maps; a share of the texels is the piece that they are tried on."""
     texels = maps.columns.shape[1]
-    piece = Maps(np.ascontiguousarray(maps.columns[:, : max(len(maps.columns), texels // share)]), maps.bases)
+    piece = Maps(centred(maps.columns[:, : max(len(maps.columns), texels // share)]), maps.bases)
     times = texels / piece.columns.shape[1]
-    ours = piece.judge(_ours(piece)())
-    peers = [*DIRECT, *(enough(peer, _ITERATIONS, "iterations", piece, ours) for peer in ITERATIVE)]
-    return compare(peers, maps, maps.judge, maps.blur, repeats=repeats, piece=piece, times=times, limit=limit, tell=tell)
+    return compare(PEERS, maps, repeats=repeats, piece=piece, times=times, limit=limit, tell=tell)
 
 
 def _ours(maps: Maps) -> Callable[[], Any]:
@@ -227,24 +229,36 @@ def _gram(maps: Maps) -> Callable[[], np.ndarray]:
     return lambda: A @ A.T
 
 
-_SKLEARN = {"needs": "sklearn", "package": "scikit-learn"}
+def _conversion(maps: Maps) -> Callable[[], np.ndarray]:
+    return lambda: maps.columns.astype(np.float64)
+
+
 _ALL = "all singular values, as we do"
-DIRECT = (
+PEERS = (
     Peer(OURS, _ours, remark="fit_basis: from float32, with all singular values and the columns' coefficients"),
     Peer("numpy.linalg.svd", _numpy_svd, remark=_ALL),
     Peer("numpy.linalg.svd, float32", lambda maps: _numpy_svd(maps, "columns"), remark=_ALL),
     Peer("scipy.linalg.svd, gesdd", _scipy_svd, remark=_ALL),
-    Peer("scipy.sparse.linalg.svds", _scipy_svds, remark="ARPACK, 16 values"),
-    Peer("sklearn PCA, full", lambda maps: _pca(maps, "full"), **_SKLEARN, remark=_ALL),
-    Peer("sklearn PCA, covariance_eigh", lambda maps: _pca(maps, "covariance_eigh"), **_SKLEARN, remark=_ALL),
-    Peer("sklearn TruncatedSVD, arpack", lambda maps: _truncated(maps, "arpack"), **_SKLEARN),
+    Peer("scipy.sparse.linalg.svds", _scipy_svds, remark="ARPACK, leading values alone"),
+    Peer("sklearn PCA, full", lambda maps: _pca(maps, "full"), needs="sklearn", remark=_ALL),
+    Peer("sklearn PCA, covariance_eigh", lambda maps: _pca(maps, "covariance_eigh"), needs="sklearn", remark=_ALL),
+    Peer("sklearn TruncatedSVD, arpack", lambda maps: _truncated(maps, "arpack"), needs="sklearn"),
     Peer("torch.linalg.svd", _torch_svd, needs="torch", remark=_ALL),
+    Peer("NumPy float64", _conversion, yardstick=True, remark="the conversion alone, which peers have for nothing"),
     Peer("NumPy Gram product", _gram, yardstick=True, remark="A @ A.T in float64 alone, the conversion apart"),
-)
-ITERATIVE = (
-    Peer("sklearn PCA, randomized", lambda maps, n: _pca(maps, "randomized", n), **_SKLEARN),
-    Peer("sklearn TruncatedSVD, randomized", lambda maps, n: _truncated(maps, "randomized", n), **_SKLEARN),
-    Peer("sklearn randomized_svd", _randomized, **_SKLEARN),
-    Peer("torch.svd_lowrank", lambda maps, n: _torch_lowrank(maps, n, "svd_lowrank"), needs="torch"),
-    Peer("torch.pca_lowrank", lambda maps, n: _torch_lowrank(maps, n, "pca_lowrank"), needs="torch"),
+    Peer("sklearn PCA, randomized", lambda maps, n: _pca(maps, "randomized", n), "sklearn", efforts=_ITERATIONS, unit=_TIMES),
+    Peer(
+        "sklearn TruncatedSVD, randomized",
+        lambda maps, n: _truncated(maps, "randomized", n),
+        "sklearn",
+        efforts=_ITERATIONS,
+        unit=_TIMES,
+    ),
+    Peer("sklearn randomized_svd", _randomized, "sklearn", efforts=_ITERATIONS, unit=_TIMES),
+    Peer(
+        "torch.svd_lowrank", lambda maps, n: _torch_lowrank(maps, n, "svd_lowrank"), "torch", efforts=_ITERATIONS, unit=_TIMES
+    ),
+    Peer(
+        "torch.pca_lowrank", lambda maps, n: _torch_lowrank(maps, n, "pca_lowrank"), "torch", efforts=_ITERATIONS, unit=_TIMES
+    ),
 )

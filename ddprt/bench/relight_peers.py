@@ -6,10 +6,9 @@ Peers get coefficients for nothing and need not cut off negative light; `Model.p
 its own affair: new arrays of the library's making, or one that was made before.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import count
 from typing import Any
 
 import jax
@@ -26,8 +25,6 @@ from ddprt.runtime.model import Model
 from ddprt.sampling.points import Samples
 
 _LOOP = 64  # frames between two looks at the clock, where one takes microseconds
-
-Arrays = tuple[np.ndarray, np.ndarray]
 
 
 def make_model(texels: int, bases: int, points: int, seed: int) -> Model:
@@ -48,56 +45,49 @@ def make_model(texels: int, bases: int, points: int, seed: int) -> Model:
     )
 
 
-@dataclass(frozen=True, eq=False)
 class Scenes:
-    """Frames to be lit, one after the other.
+    """Models of one size that take turns, and a frame that each is lit by.
 
-    Attributes:
-      models: taken in turn; a single one stays in the caches if it fits them.
+    The turn is everybody's: who comes second would else find in the caches what the first one has just read.
+
+    Args:
+      models: a single one stays in the caches if it fits them.
       values: measured light of the frame, W/m².
     """
 
-    models: list[Model]
-    values: Float[np.ndarray, "points 3"]
+    def __init__(self, models: list[Model], values: Float[np.ndarray, "points 3"]) -> None:
+        self.models, self.values = models, values
+        self.coefficients = [model.coefficients(values) for model in models]
+        self.bases = [np.asarray(learned(model).basis) for model in models]
+        self.bases_count, self.texels = self.bases[0].shape
+        self.turn = 0
 
-    @cached_property
-    def coefficients(self) -> list[np.ndarray]:
-        """Those of each model, (3, bases)."""
-        return [model.coefficients(self.values) for model in self.models]
-
-    @cached_property
-    def bases(self) -> list[np.ndarray]:
-        """Those of each model, (bases, texels)."""
-        return [np.asarray(learned(model).basis) for model in self.models]
-
-    @property
-    def texels(self) -> int:
-        """Of one model."""
-        return self.bases[0].shape[1]
+    def advance(self) -> int:
+        """The model whose turn it is."""
+        self.turn = (self.turn + 1) % len(self.models)
+        return self.turn
 
     @property
     def moved(self) -> int:
         """Bytes that a frame cannot do without: the basis read, the light written."""
-        return 4 * self.texels * (len(self.bases[0]) + 3)
+        return 4 * self.texels * (self.bases_count + 3)
 
-    @cached_property
     def exact(self) -> np.ndarray:
-        """Light of the first model in float64, (texels, 3)."""
-        part = learned(self.models[0])
+        """Light of the model whose turn it was, in float64, (texels, 3)."""
+        part = learned(self.models[self.turn])
         u = np.einsum("gbp,pg->bg", np.asarray(part.matrix, np.float64), self.values.astype(np.float64))
-        return np.maximum(self.bases[0].T.astype(np.float64) @ u, 0)
+        return np.maximum(np.asarray(part.basis).T.astype(np.float64) @ u, 0)
 
     @property
     def blur(self) -> dict[str, float]:
         """Bound on rounding of sums of positive products in float32, one after the other (Higham 2002, 3.1): n EPS."""
-        bases, points = learned(self.models[0]).matrix.shape[1:]
-        return {"relative RMSE": (bases + points) * EPS}
+        return {"relative RMSE": (self.bases_count + len(self.values)) * EPS}
 
     def judge(self, light: Any) -> dict[str, float]:
-        """Relative RMSE of the first model's light, given by texels or by channels."""
-        found = np.asarray(light, np.float64)
-        found = found if found.shape == self.exact.shape else found.T
-        return {"relative RMSE": float(np.linalg.norm(found - self.exact) / np.linalg.norm(self.exact))}
+        """Relative RMSE of light that was just made, given by texels or by channels."""
+        found, exact = np.asarray(light, np.float64), self.exact()
+        found = found if found.shape == exact.shape else found.T
+        return {"relative RMSE": float(np.linalg.norm(found - exact) / np.linalg.norm(exact))}
 
 
 def learned(model: Model) -> LinearTransfer:
@@ -112,44 +102,39 @@ def make_scenes(texels: int, bases: int, points: int, models: int, seed: int) ->
     return Scenes(made, seeds.stream(seed, "peers frame").random((points, 3), np.float32))
 
 
-def relight_rows(scenes: Scenes, *, repeats: int, tell: Callable[[str], None] = lambda line: None) -> list[Row]:
+def relight_rows(scenes: Scenes, *, repeats: int, tell: Callable[[], None] = lambda: None) -> list[Row]:
     """Everyone's frame."""
-    return compare(RELIGHT, scenes, scenes.judge, scenes.blur, repeats=repeats, tell=tell)
-
-
-def _turns(scenes: Scenes) -> Iterator[int]:
-    return (index % len(scenes.models) for index in count())
+    return compare(RELIGHT, scenes, repeats=repeats, tell=tell)
 
 
 def _predict(scenes: Scenes) -> Callable[[], np.ndarray]:
-    turn = _turns(scenes)
-    return lambda: scenes.models[next(turn)].predict(scenes.values)
+    return lambda: scenes.models[scenes.advance()].predict(scenes.values)
 
 
 def _compose(scenes: Scenes) -> Callable[[], jax.Array]:
-    turn, add = _turns(scenes), jax.jit(compose)
+    add = jax.jit(compose)
     parts = [learned(model) for model in scenes.models]
     given = [(jnp.asarray(u[None]), part.basis, part.mean) for u, part in zip(scenes.coefficients, parts, strict=True)]
-    return lambda: add(*given[next(turn)])[0]
+    return lambda: add(*given[scenes.advance()])[0]
 
 
 def _numpy(scenes: Scenes) -> Callable[[], np.ndarray]:
-    turn, u, B = _turns(scenes), scenes.coefficients, scenes.bases
+    u, B = scenes.coefficients, scenes.bases
 
     def work() -> np.ndarray:
-        i = next(turn)
+        i = scenes.advance()
         return u[i] @ B[i]
 
     return work
 
 
 def _numpy_into(scenes: Scenes, by_texels: bool) -> Callable[[], np.ndarray]:
-    turn, u, B = _turns(scenes), scenes.coefficients, scenes.bases
+    u, B = scenes.coefficients, scenes.bases
     # One output for each model, or a cache would hold it.
     outs = [np.zeros((scenes.texels, 3) if by_texels else (3, scenes.texels), np.float32) for _ in B]
 
     def work() -> np.ndarray:
-        i = next(turn)
+        i = scenes.advance()
         return np.matmul(B[i].T, u[i].T, out=outs[i]) if by_texels else np.matmul(u[i], B[i], out=outs[i])
 
     return work
@@ -158,13 +143,12 @@ def _numpy_into(scenes: Scenes, by_texels: bool) -> Callable[[], np.ndarray]:
 def _torch(scenes: Scenes, into: bool) -> Callable[[], Any]:
     import torch
 
-    turn = _turns(scenes)
     u = [torch.from_numpy(part) for part in scenes.coefficients]
     B = [torch.from_dlpack(part) for part in scenes.bases]
     outs = [torch.zeros((3, scenes.texels)) for _ in B] if into else []
 
     def work() -> Any:
-        i = next(turn)
+        i = scenes.advance()
         return torch.matmul(u[i], B[i], out=outs[i]) if into else torch.matmul(u[i], B[i])
 
     return work
@@ -217,9 +201,9 @@ def make_frames(model: Model, frames: int, seed: int, *, one: bool) -> Frames:
     return Frames(model, seeds.stream(seed, "peers frames").random((number, model.points, 3), np.float32), one)
 
 
-def transfer_rows(frames: Frames, *, repeats: int, tell: Callable[[str], None] = lambda line: None) -> list[Row]:
+def transfer_rows(frames: Frames, *, repeats: int, tell: Callable[[], None] = lambda: None) -> list[Row]:
     """Everyone's coefficients; seconds are of one frame."""
-    return compare(TRANSFER, frames, frames.judge, frames.blur, repeats=repeats, frames=len(frames.values), tell=tell)
+    return compare(TRANSFER, frames, repeats=repeats, frames=len(frames.values), tell=tell)
 
 
 def _public(frames: Frames) -> Callable[[], np.ndarray]:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from ddprt import seeds
 from ddprt.bench.fit_peers import EPS
-from ddprt.bench.standing import OURS, Peer, Row, compare, enough
+from ddprt.bench.standing import OURS, Peer, Row, compare
 from ddprt.fitting.transfer import fit_transfer
 
 _TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
@@ -74,11 +74,9 @@ def make_pairs(spectrum: np.ndarray, points: int, bases: int, seed: int) -> Pair
     return Pairs(X.astype(np.float32), C.astype(np.float32), float(1e-6 * spectrum[0] ** 2))
 
 
-def ridge_rows(pairs: Pairs, *, repeats: int, tell: Callable[[str], None] = lambda line: None) -> list[Row]:
+def ridge_rows(pairs: Pairs, *, repeats: int, tell: Callable[[], None] = lambda: None) -> list[Row]:
     """Everyone's map."""
-    ours = pairs.judge(_ours(pairs)())
-    peers = [*DIRECT, *(enough(peer, _TOLERANCES, "tolerance", pairs, ours) for peer in ITERATIVE)]
-    return compare(peers, pairs, pairs.judge, pairs.blur, repeats=repeats, tell=tell)
+    return compare(PEERS, pairs, repeats=repeats, tell=tell)
 
 
 def _ours(pairs: Pairs) -> Callable[[], Any]:
@@ -114,15 +112,18 @@ def _sklearn(pairs: Pairs, solver: str, tolerance: float = 1e-4) -> Callable[[],
     return work
 
 
-_SKLEARN = {"needs": "sklearn", "package": "scikit-learn"}
-DIRECT = (
+PEERS = (
     Peer(OURS, _ours, remark="fit_transfer: with leave-one-out error, condition, rank and remarks; any other ridge is free"),
     Peer("numpy.linalg.lstsq", _lstsq, remark="of the measurements with the ridge's rows below, which are made for nothing"),
     Peer("numpy, normal equations", _normal, remark="of the smaller of the two sizes"),
-    Peer("sklearn Ridge, svd", lambda pairs: _sklearn(pairs, "svd"), **_SKLEARN),
-    Peer("sklearn Ridge, cholesky", lambda pairs: _sklearn(pairs, "cholesky"), **_SKLEARN),
-)
-ITERATIVE = (
-    Peer("sklearn Ridge, lsqr", lambda pairs, tolerance: _sklearn(pairs, "lsqr", tolerance), **_SKLEARN),
-    Peer("sklearn Ridge, sparse_cg", lambda pairs, tolerance: _sklearn(pairs, "sparse_cg", tolerance), **_SKLEARN),
+    Peer("sklearn Ridge, svd", lambda pairs: _sklearn(pairs, "svd"), needs="sklearn"),
+    Peer("sklearn Ridge, cholesky", lambda pairs: _sklearn(pairs, "cholesky"), needs="sklearn"),
+    Peer("sklearn Ridge, lsqr", lambda pairs, e: _sklearn(pairs, "lsqr", e), "sklearn", efforts=_TOLERANCES, unit="tolerance"),
+    Peer(
+        "sklearn Ridge, sparse_cg",
+        lambda pairs, e: _sklearn(pairs, "sparse_cg", e),
+        "sklearn",
+        efforts=_TOLERANCES,
+        unit="tolerance",
+    ),
 )

@@ -140,8 +140,12 @@ def _by_xla(source: tuple[jax.Array, ...], writes: int) -> Callable[[], Any]:
 
 def _by_loops(pool: ThreadPoolExecutor, source: np.ndarray, target: np.ndarray, block: int) -> Callable[[], None]:
     ends = np.linspace(0, source.shape[1], threads() + 1).astype(int)
-    spans = list(pairwise(ends))
-    return lambda: list(pool.map(lambda span: _add(source, target, *span, block), spans)).clear()
+
+    def work() -> None:
+        for done in [pool.submit(_add, source, target, start, stop, block) for start, stop in pairwise(ends)]:
+            done.result()
+
+    return work
 
 
 @compiled

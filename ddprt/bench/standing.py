@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import jax
 import numpy as np
@@ -18,9 +18,23 @@ import numpy as np
 from ddprt.bench.timing import Timing, compiling, peak_memory
 
 OURS = "ddprt"
+_PIP = {"sklearn": "scikit-learn"}  # packages that pip calls otherwise
 _PATIENCE = 60.0  # seconds after which no further turn begins
 
 Verdict = Literal["ours", "equal or better", "less accurate", "yardstick", "skipped"]
+
+
+class Problem(Protocol):
+    """What peers solve."""
+
+    @property
+    def blur(self) -> dict[str, float]:
+        """What rounding alone does to each error; differences below it tell nothing."""
+        ...
+
+    def judge(self, result: Any, /) -> dict[str, float]:
+        """Errors of a result, the smaller the better."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -31,17 +45,25 @@ class Peer:
       name: as its users call it.
       prepare: takes the problem, leaves the work to be timed; conversions of the input happen here, at no charge.
       needs: module that must be installed.
-      package: what pip calls it.
       remark: what it does more or less than we do.
       yardstick: timed and shown, but not a way to the result.
+      efforts: what `prepare` takes beside the problem, from the cheapest on; the first is taken that is accurate enough.
+      unit: of the efforts, for the name.
     """
 
     name: str
     prepare: Callable[..., Callable[[], Any]]
     needs: str = ""
-    package: str = ""
     remark: str = ""
     yardstick: bool = False
+    efforts: tuple[float, ...] = ()
+    unit: str = ""
+
+    def at(self, effort: float | None) -> "Peer":
+        """The same with this effort settled; None for one that takes none."""
+        if effort is None:
+            return self
+        return replace(self, name=f"{self.name}, {effort:g} {self.unit}", prepare=lambda problem: self.prepare(problem, effort))
 
     @property
     def missing(self) -> str:
@@ -51,7 +73,7 @@ class Peer:
         try:
             import_module(self.needs)
         except ImportError as error:
-            return f"{self.needs} is not installed ({error}); pip install {self.package or self.needs}"
+            return f"{self.needs} is not installed ({error}); pip install {_PIP.get(self.needs, self.needs)}"
         return ""
 
 
@@ -114,83 +136,76 @@ def in_turn(works: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, l
 
 def compare(
     peers: Sequence[Peer],
-    whole: Any,
-    judge: Callable[[Any], dict[str, float]],
-    blur: Mapping[str, float],
+    whole: Problem,
     *,
     repeats: int,
     frames: int = 1,
-    piece: Any = None,
+    piece: Problem | None = None,
     times: float = 1.0,
     limit: float = np.inf,
-    tell: Callable[[str], None] = lambda line: None,
+    tell: Callable[[], None] = lambda: None,
 ) -> list[Row]:
     """Rows of a comparison: ours first, then the accurate ones by time, the less accurate ones, yardsticks, those skipped.
 
     Args:
       peers: `OURS` among them.
       whole: the problem.
-      judge: errors of a result.
-      blur: what rounding alone does to each error; differences below it tell nothing.
       repeats: turns.
       frames: how many problems a work solves; seconds are of one.
       piece: a smaller problem to try everyone on first; None tries nobody.
       times: how much more work `whole` is than `piece`.
       limit: seconds that a run of `whole` may be expected to take.
-      tell: is told who is at work.
+      tell: called once for each peer.
     """
     works: dict[str, Callable[[], Any]] = {}
-    errors: dict[str, dict[str, float]] = {}
-    spent, skipped = {}, {peer.name: peer.missing for peer in peers if peer.missing}
-    for peer in peers:
-        if peer.name in skipped:
+    rows: dict[str, Row] = {}
+    spent: dict[str, float] = {}
+    ours: dict[str, float] = {}
+    small: dict[str, float] = {}
+    for peer in sorted(peers, key=lambda peer: peer.name != OURS):
+        tell()
+        if peer.missing:
+            rows[peer.name] = Row(peer.name, "skipped", reason=peer.missing)
             continue
-        tell(peer.name)
-        reason = "" if piece is None or peer.name == OURS else _too_much(peer.prepare(piece), times, limit)
-        if reason:
-            skipped[peer.name] = reason
-            continue
-        works[peer.name] = peer.prepare(whole)
-        with compiling() as found:
-            result = jax.block_until_ready(works[peer.name]())
-        spent[peer.name] = found[0]
-        errors[peer.name] = {} if peer.yardstick else judge(result)
-        del result  # it may be gigabytes
-    tell("all in turn")
+        for effort in _worth_trying(peer, piece, small):
+            tried = peer.at(effort)
+            reason = "" if piece is None or peer.name == OURS else _too_much(tried.prepare(piece), times, limit)
+            if reason:
+                rows[peer.name] = rows.get(peer.name) or Row(tried.name, "skipped", reason=reason)
+                break
+            work = tried.prepare(whole)
+            with compiling() as found:
+                result = jax.block_until_ready(work())
+            errors = {} if peer.yardstick else whole.judge(result)
+            del result  # it may be gigabytes
+            if peer.name == OURS:
+                ours, small = errors, piece.judge(peer.prepare(piece)()) if piece is not None else {}
+            fixed: Verdict | None = "ours" if peer.name == OURS else "yardstick" if peer.yardstick else None
+            mark = fixed or verdict(errors, ours, whole.blur)
+            works[peer.name], spent[peer.name] = work, found[0]
+            rows[peer.name] = Row(tried.name, mark, errors=errors, reason=peer.remark)
+            if mark != "less accurate":
+                break
     timings = {name: _timing(np.array(found) / frames, spent[name]) for name, found in in_turn(works, repeats).items()}
-    rows = [Row(name, "skipped", reason=reason) for name, reason in skipped.items()]
-    for peer in peers:
-        if peer.name in works:
-            mark: Verdict = "ours" if peer.name == OURS else "yardstick" if peer.yardstick else "less accurate"
-            if mark == "less accurate":
-                mark = verdict(errors[peer.name], errors[OURS], blur)
-            timing = timings[peer.name]
-            rows.append(Row(peer.name, mark, timing.median / timings[OURS].median, timing, errors[peer.name], peer.remark))
+    for name, timing in timings.items():
+        rows[name] = replace(rows[name], seconds=timing, ratio=timing.median / timings[OURS].median)
     order = ("ours", "equal or better", "less accurate", "yardstick", "skipped")
-    return sorted(rows, key=lambda row: (order.index(row.verdict), row.ratio or 0))
+    return sorted(rows.values(), key=lambda row: (order.index(row.verdict), row.ratio or 0))
+
+
+def _worth_trying(peer: Peer, piece: Problem | None, ours: Mapping[str, float]) -> Sequence[float | None]:
+    """Efforts from the first that does on the piece, the last one at least; a single None for a peer that takes none."""
+    if not peer.efforts or piece is None:
+        return peer.efforts or (None,)
+    for index, effort in enumerate(peer.efforts):
+        if verdict(piece.judge(peer.at(effort).prepare(piece)()), ours, piece.blur) == "equal or better":
+            return peer.efforts[index:]
+    return peer.efforts[-1:]
 
 
 def _timing(seconds: np.ndarray, compile: float) -> Timing:
     low, median, high = np.quantile(seconds, [0.25, 0.5, 0.75])
     return Timing(float(median), float(low), float(high), compile, len(seconds))
-
-
-def enough(peer: Peer, efforts: Sequence[float], word: str, problem: Any, ours: Mapping[str, float]) -> Peer:
-    """A peer that iterates, at the first effort that makes it as accurate as we are; at the last one where none does.
-
-    Args:
-      peer: its `prepare` takes the problem and the effort.
-      efforts: from the cheapest on.
-      word: what efforts are counted in, for the name.
-      problem: has `judge` and `blur`; a piece of the problem will do.
-      ours: our errors on it.
-    """
-    if peer.missing:
-        return peer
-    for effort in efforts:
-        if verdict(problem.judge(peer.prepare(problem, effort)()), ours, problem.blur) == "equal or better":
-            break
-    return replace(peer, name=f"{peer.name}, {effort:g} {word}", prepare=lambda problem: peer.prepare(problem, effort))
 
 
 def best(rows: Sequence[Row]) -> Row | None:
