@@ -32,7 +32,7 @@ _ITERATIONS = (2, 4, 8, 16, 32)
 _TIMES = "iterations"
 _MORE = 10  # vectors that randomised solvers carry beyond those asked for, scikit-learn's default
 
-Solution = tuple[np.ndarray, np.ndarray]
+Solution = tuple[Any, Any]
 """Leading singular values, and right vectors as rows, of any length."""
 
 
@@ -125,7 +125,9 @@ def centred(columns: Float[np.ndarray, "columns texels"]) -> Float[np.ndarray, "
     return columns - columns.mean(1, keepdims=True, dtype=np.float64).astype(np.float32)
 
 
-def fit_rows(maps: Maps, *, repeats: int, limit: float, share: int = 10, tell: Callable[[], None] = lambda: None) -> list[Row]:
+def fit_rows(
+    maps: Maps, *, repeats: int, limit: float | int, share: int = 10, tell: Callable[[], None] = lambda: None
+) -> list[Row]:
     """Everyone's basis of the maps; a share of the texels is the piece that they are tried on."""
     texels = maps.columns.shape[1]
     piece = Maps(centred(maps.columns[:, : max(len(maps.columns), texels // share)]), maps.bases)
@@ -165,7 +167,7 @@ def _scipy_svds(maps: Maps) -> Callable[[], Solution]:
     return work
 
 
-def _pca(maps: Maps, solver: str, iterations: float | str = "auto") -> Callable[[], Solution]:
+def _pca(maps: Maps, solver: str, iterations: float | int | str = "auto") -> Callable[[], Solution]:
     from sklearn.decomposition import PCA
 
     A, n = maps.wide.T, iterations if isinstance(iterations, str) else int(iterations)
@@ -179,7 +181,7 @@ def _pca(maps: Maps, solver: str, iterations: float | str = "auto") -> Callable[
     return work
 
 
-def _truncated(maps: Maps, algorithm: str, iterations: float = 5) -> Callable[[], Solution]:
+def _truncated(maps: Maps, algorithm: str, iterations: float | int = 5) -> Callable[[], Solution]:
     from sklearn.decomposition import TruncatedSVD
 
     A = maps.wide.T
@@ -192,7 +194,7 @@ def _truncated(maps: Maps, algorithm: str, iterations: float = 5) -> Callable[[]
     return work
 
 
-def _randomized(maps: Maps, iterations: float) -> Callable[[], Solution]:
+def _randomized(maps: Maps, iterations: float | int) -> Callable[[], Solution]:
     from sklearn.utils.extmath import randomized_svd
 
     A = maps.wide
@@ -211,7 +213,7 @@ def _torch_svd(maps: Maps) -> Callable[[], Solution]:
     return work
 
 
-def _torch_lowrank(maps: Maps, iterations: float, name: str) -> Callable[[], Solution]:
+def _torch_lowrank(maps: Maps, iterations: float | int, name: str) -> Callable[[], Solution]:
     import torch
 
     A, settings = torch.from_numpy(maps.wide), {"center": False} if name == "pca_lowrank" else {}

@@ -7,10 +7,9 @@ machine applies, it is measured in the same run.
 import subprocess
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -53,13 +52,13 @@ class Sizes:
     side: int = 1024
     frames: int = 1024
     repeats: int = 7
-    limit: float = 120.0
+    limit: float | int = 120
     product: int = 3072
     disk: int = 512 << 20
     stream: int | None = None
 
 
-QUICK = Sizes(texels=100_000, repeats=3, limit=4.0, product=1536, disk=128 << 20)
+QUICK = Sizes(texels=100_000, repeats=3, limit=4, product=1536, disk=128 << 20)
 
 
 def peers(config: Config, progress: Progress, *, quick: bool = False) -> dict[str, Any]:
@@ -175,7 +174,7 @@ def _comparison(
 
 def _bake() -> dict[str, Any]:
     reason = "takes minutes and a process of Mitsuba's own: python experiments/bake_speed.py --quick (docs/baking.md)"
-    if find_spec("mitsuba") is None:
+    if installed("mitsuba") is None:
         reason = f'mitsuba is not installed; pip install "ddprt[reference]"; then: {reason}'
     row = Row("Mitsuba 3", "skipped", reason=reason)
     return _comparison("bake", "indirect light of many lightings", [row], {})
@@ -246,7 +245,9 @@ def _line(row: dict[str, Any], limited: bool) -> str:
 @contextmanager
 def _same_threads(count: int) -> Iterator[None]:
     """BLAS, OpenMP and torch with as many threads as JAX takes."""
-    torch = import_module("torch") if find_spec("torch") else None
+    torch: Any = None
+    with suppress(ImportError):
+        torch = import_module("torch")
     before = torch.get_num_threads() if torch else 0
     with threadpool_limits(limits=count):
         if torch:

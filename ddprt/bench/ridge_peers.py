@@ -100,7 +100,7 @@ def _normal(pairs: Pairs) -> Callable[[], np.ndarray]:
     return work
 
 
-def _sklearn(pairs: Pairs, solver: str, tolerance: float = 1e-4) -> Callable[[], np.ndarray]:
+def _sklearn(pairs: Pairs, solver: str, tolerance: float | int = 1e-4) -> Callable[[], np.ndarray]:
     from sklearn.linear_model import Ridge
 
     X, C = pairs.wide

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -24,6 +24,7 @@ _PATIENCE = 60.0  # seconds after which no further turn begins
 Verdict = Literal["ours", "equal or better", "less accurate", "yardstick", "skipped"]
 
 
+@runtime_checkable
 class Problem(Protocol):
     """What peers solve."""
 
@@ -56,10 +57,10 @@ class Peer:
     needs: str = ""
     remark: str = ""
     yardstick: bool = False
-    efforts: tuple[float, ...] = ()
+    efforts: tuple[float | int, ...] = ()
     unit: str = ""
 
-    def at(self, effort: float | None) -> "Peer":
+    def at(self, effort: float | int | None) -> "Peer":
         """The same with this effort settled; None for one that takes none."""
         if effort is None:
             return self
@@ -141,8 +142,8 @@ def compare(
     repeats: int,
     frames: int = 1,
     piece: Problem | None = None,
-    times: float = 1.0,
-    limit: float = np.inf,
+    times: float | int = 1,
+    limit: float | int = np.inf,
     tell: Callable[[], None] = lambda: None,
 ) -> list[Row]:
     """Rows of a comparison: ours first, then the accurate ones by time, the less accurate ones, yardsticks, those skipped.
@@ -193,7 +194,7 @@ def compare(
     return sorted(rows.values(), key=lambda row: (order.index(row.verdict), row.ratio or 0))
 
 
-def _worth_trying(peer: Peer, piece: Problem | None, ours: Mapping[str, float]) -> Sequence[float | None]:
+def _worth_trying(peer: Peer, piece: Problem | None, ours: Mapping[str, float]) -> Sequence[float | int | None]:
     """Efforts from the first that does on the piece, the last one at least; a single None for a peer that takes none."""
     if not peer.efforts or piece is None:
         return peer.efforts or (None,)
@@ -214,7 +215,7 @@ def best(rows: Sequence[Row]) -> Row | None:
     return min(ranked, key=lambda row: row.ratio or np.inf, default=None)
 
 
-def _too_much(work: Callable[[], Any], times: float, limit: float) -> str:
+def _too_much(work: Callable[[], Any], times: float | int, limit: float | int) -> str:
     """Why the whole is not tried, from runs of the piece; empty where it is."""
     with peak_memory() as memory:
         work()
