@@ -273,17 +273,17 @@ def test_who_would_take_too_long_or_too_much_is_left_out_untried(monkeypatch: py
 
 @pytest.fixture(scope="module")
 def maps() -> Maps:
-    """Singular values from 1 to 1e-5, of which the 6th is 5e-4: too deep for float32 arithmetic."""
-    return Maps(make_columns(np.logspace(0, -5, 24), 3000, 0), 6)
+    """Singular values from 1 to 1e-12, of which the 6th is 2.5e-3: too deep for float32 arithmetic."""
+    return Maps(make_columns(np.logspace(0, -12, 24), 3000, 0), 6)
 
 
 def test_truth_is_that_of_the_whole_decomposition(maps: Maps, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fit_peers, "_TILE", 700)
     sigma, right = Maps(maps.columns, maps.bases).exact
     _, whole, vectors = np.linalg.svd(maps.columns.astype(float), full_matrices=False)
-    # Both are stable: off by a few eps sigma_1, and vectors by that over the gap, which is 0.4 of the 6th value.
+    # Both are stable: off by a few eps sigma_1, and vectors by that over the gap, which is 0.6 of the 6th value.
     np.testing.assert_allclose(sigma, whole, atol=100 * 2.2e-16 * whole[0])
-    np.testing.assert_allclose(np.abs(right @ vectors[:6].T), np.eye(6), atol=100 * 2.2e-16 * whole[0] / (0.4 * whole[5]))
+    np.testing.assert_allclose(np.abs(right @ vectors[:6].T), np.eye(6), atol=100 * 2.2e-16 * whole[0] / (0.6 * whole[5]))
 
 
 @pytest.mark.parametrize("angle", [1e-6, 1e-3, 0.5])
@@ -292,7 +292,7 @@ def test_judge_tells_angle_and_values(maps: Maps, angle: float) -> None:
     turned = right[:6].copy()
     turned[3] = np.cos(angle) * right[3] + np.sin(angle) * right[20]
     found = maps.judge((sigma * (1 + np.eye(24)[2] * 1e-3), turned * np.array([[1, -2, 3, 4, 5, 6]]).T))
-    # Rounding of the decomposition leaves 100 eps sigma_1 over the gap, as above: 3e-11.
+    # Rounding of the decomposition leaves 100 eps sigma_1 over the gap, as above: 1.5e-11.
     assert found["sine of angle"] == pytest.approx(np.sin(angle), abs=1e-10)
     assert found["singular values"] == pytest.approx(1e-3, abs=1e-10)
     assert np.isnan(maps.judge((sigma[:5], right[:5]))["sine of angle"])
@@ -326,10 +326,10 @@ def test_every_way_to_a_basis_is_the_same_way(maps: Maps) -> None:
     rows = fit_rows(maps, repeats=1, limit=60)
     found = {row.name: row for row in rows}
     assert rows[0].verdict == "ours"
-    # Half of float32's digits are gone at the 6th value: single precision is less accurate, whatever its time.
-    assert found["numpy.linalg.svd, float32"].verdict == "less accurate"
+    # Single precision is off by eps sigma_1, 400 times as much of the 6th value: less accurate, whatever its time.
+    assert found["scipy.linalg.svd, gesdd, float32"].verdict == "less accurate"
     for row in rows[1:]:
-        if row.name != "numpy.linalg.svd, float32" and row.verdict not in ("yardstick", "skipped"):
+        if row.name != "scipy.linalg.svd, gesdd, float32" and row.verdict not in ("yardstick", "skipped"):
             assert row.verdict == "equal or better", row
     for name in ("numpy.linalg.svd", "scipy.linalg.svd, gesdd", "scipy.sparse.linalg.svds"):
         assert found[name].verdict == "equal or better", found[name]

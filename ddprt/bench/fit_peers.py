@@ -145,13 +145,13 @@ def _ours(maps: Maps) -> Callable[[], Any]:
     return work
 
 
-def _numpy_svd(maps: Maps, dtype: str = "wide") -> Callable[[], Solution]:
-    A = getattr(maps, dtype)
+def _numpy_svd(maps: Maps) -> Callable[[], Solution]:
+    A = maps.wide
     return lambda: np.linalg.svd(A, full_matrices=False)[1:]
 
 
-def _scipy_svd(maps: Maps) -> Callable[[], Solution]:
-    A = maps.wide
+def _scipy_svd(maps: Maps, single: bool = False) -> Callable[[], Solution]:
+    A = maps.columns if single else maps.wide
     return lambda: scipy.linalg.svd(A, full_matrices=False, lapack_driver="gesdd", check_finite=False)[1:]
 
 
@@ -239,8 +239,9 @@ _ALL = "all singular values, as we do"
 PEERS = (
     Peer(OURS, _ours, remark="fit_basis: from float32, with all singular values and the columns' coefficients"),
     Peer("numpy.linalg.svd", _numpy_svd, remark=_ALL),
-    Peer("numpy.linalg.svd, float32", lambda maps: _numpy_svd(maps, "columns"), remark=_ALL),
     Peer("scipy.linalg.svd, gesdd", _scipy_svd, remark=_ALL),
+    # NumPy has no such thing: it computes in float64 whatever it is given.
+    Peer("scipy.linalg.svd, gesdd, float32", lambda maps: _scipy_svd(maps, single=True), remark=_ALL),
     Peer("scipy.sparse.linalg.svds", _scipy_svds, remark="ARPACK, leading values alone"),
     Peer("sklearn PCA, full", lambda maps: _pca(maps, "full"), needs="sklearn", remark=_ALL),
     Peer("sklearn PCA, covariance_eigh", lambda maps: _pca(maps, "covariance_eigh"), needs="sklearn", remark=_ALL),
