@@ -4,13 +4,11 @@ Equal accuracy first, then time: who is less accurate than we are is shown with 
 machine applies, it is measured in the same run.
 """
 
-import subprocess
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -22,7 +20,7 @@ from ddprt.bench.relight_peers import RELIGHT, TRANSFER, make_frames, make_model
 from ddprt.bench.ridge_peers import make_pairs, ridge_rows
 from ddprt.bench.standing import OURS, Row, best
 from ddprt.config import Config
-from ddprt.machine import installed, machine
+from ddprt.machine import commit, installed, machine
 from ddprt.progress import Progress
 
 GRAM = "NumPy Gram product"
@@ -90,7 +88,7 @@ def measure(config: Config, progress: Progress, sizes: Sizes) -> dict[str, Any]:
     packages = {name: installed(name) for name in ("scikit-learn", "torch", "mitsuba")}
     return {
         "machine": machine() | {"peers": packages, "backend": jax.default_backend()},
-        "commit": _commit(),
+        "commit": commit(),
         "threads": count,
         "sizes": vars(sizes),
         "limits": {name: limit.record() for name, limit in limits.items() if not isinstance(limit, roofline.Cache)}
@@ -257,16 +255,3 @@ def _same_threads(count: int) -> Iterator[None]:
         finally:
             if torch:
                 torch.set_num_threads(before)
-
-
-def _commit() -> str:
-    """Of the sources, with a + where they were changed since; empty where they are not in a repository."""
-    where = Path(__file__).parent
-    try:
-        told = [
-            subprocess.run(["git", "-C", where, *words], capture_output=True, text=True, check=True).stdout.strip()
-            for words in (["rev-parse", "--short=12", "HEAD"], ["status", "--porcelain", "--untracked-files=no"])
-        ]
-    except (OSError, subprocess.CalledProcessError):
-        return ""
-    return told[0] + ("+" if told[1] else "")

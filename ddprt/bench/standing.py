@@ -1,8 +1,8 @@
 """Who stands where: equal accuracy first, then time.
 
-Everyone is run on a small piece of the problem first. That warms them up, and tells those that would take too long or too
-much memory on the whole, who are left out with that as the reason. Then all take turns, so that whatever else the machine
-does hits them alike.
+Where there is a small piece of the problem, it tells who would take too long or too much memory on the whole, and leaves them
+out with that as the reason. The others are run once and judged; then they take turns, so that whatever else the machine does
+hits them alike.
 """
 
 import time
@@ -187,7 +187,7 @@ def compare(
             rows[peer.name] = Row(tried.name, mark, errors=errors, reason=peer.remark)
             if mark != "less accurate":
                 break
-    timings = {name: _timing(np.array(found) / frames, spent[name]) for name, found in in_turn(works, repeats).items()}
+    timings = {name: _timing(found, spent[name]).each(frames) for name, found in in_turn(works, repeats).items()}
     for name, timing in timings.items():
         rows[name] = replace(rows[name], seconds=timing, ratio=timing.median / timings[OURS].median)
     order = ("ours", "equal or better", "less accurate", "yardstick", "skipped")
@@ -204,7 +204,7 @@ def _worth_trying(peer: Peer, piece: Problem | None, ours: Mapping[str, float]) 
     return peer.efforts[-1:]
 
 
-def _timing(seconds: np.ndarray, compile: float) -> Timing:
+def _timing(seconds: list[float], compile: float) -> Timing:
     low, median, high = np.quantile(seconds, [0.25, 0.5, 0.75])
     return Timing(float(median), float(low), float(high), compile, len(seconds))
 
