@@ -2,14 +2,16 @@
 
 Question: how many lightings chosen by what their measurements tell reach the held-out error of 128 random ones, and what do
           measurement points by pivoted QR gain over blue noise with the same number of shaded samples?
-Command:  python experiments/active.py [--quick]
+Command:  python experiments/active.py [--quick] [--seeds 6] [--most 256]
 Answer:   docs/active.md
 
 A pool of lightings is baked once per scene, into runs/active-NAME. A seed shuffles it: random design takes the first N, the
-others choose N of the first 8 N (or of all there are). Held-out lightings are random and the same for all.
+others choose N of the first 8 N (or of all there are). Held-out lightings are random and the same for all. Scores of a scene
+are kept beside its pool: a run that was stopped goes on with the next scene.
 """
 
-import sys
+import argparse
+import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -132,6 +134,7 @@ def facility(rows: np.ndarray, count: int) -> np.ndarray:
     return np.array(chosen)
 
 
+SHORT = ("k-centre", "facility")  # shown where they may matter, not along all of the curve
 WAYS = {"random": first, "active": choose_rows, "D-optimal": greatest_variance, "k-centre": farthest, "facility": facility}
 
 
@@ -142,6 +145,8 @@ def of_lightings(pool: Pool, points: int, seeds: int, counts: tuple[int, ...]) -
     found: dict[str, dict[int, np.ndarray]] = {way: {} for way in WAYS}
     for count in counts:
         for way, choose in WAYS.items():
+            if way in SHORT and count > 64:
+                continue
             trials = []
             for seed in range(seeds):
                 candidates = np.random.default_rng(seed).permutation(pool.train)[: EACH * count]
@@ -175,6 +180,8 @@ def mean(trials: np.ndarray) -> np.ndarray:
 def table(name: str, what: str, found: dict[str, dict[int, np.ndarray]]) -> None:
     for count in next(iter(found.values())):
         for way, of in found.items():
+            if count not in of:
+                continue
             row = "".join(f"{score:8.4f}" for score in mean(of[count]))
             print(f"{name:13}{what:10}{count:5d}  {way:11}{row}   x/ {np.exp(np.log(of[count][:, 0]).std()):.3f}", flush=True)
 
@@ -206,30 +213,58 @@ def draw(lightings: dict, points: dict) -> None:
     figure.savefig("docs/active.png", dpi=90)
 
 
-def main(*asked: str) -> None:
-    quick = "--quick" in asked
-    names, seeds = (("cornell",), 2) if quick else (tuple(SCENES), 6)
-    counts, places, pool_size = ((8, 16, 32), (32, 128), 256) if quick else (COUNTS, POINTS, 2048)
+def scene_scores(name: str, quick: bool, seeds: int, most: int) -> dict[str, dict[str, dict[int, np.ndarray]]]:
+    """Scores of a scene over lightings and over points, from an earlier run if there is one."""
+    train, test = (256, 64) if quick else (2048, 256)
+    kept = Path("runs") / f"active-{name}-{train}-{seeds}-{most}.json"
+    if kept.is_file():
+        found = json.loads(kept.read_text())
+        return {
+            over: {way: {int(n): np.array(of) for n, of in ways.items()} for way, ways in both.items()}
+            for over, both in found.items()
+        }
+    pool = Pool.of(name, train, test)
+    points = (32, 128) if quick else POINTS
+    found = {
+        "lightings": of_lightings(pool, SCENES[name][2], seeds, tuple(count for count in COUNTS if count <= most)),
+        "points": of_points(pool, seeds, points),
+    }
+    plain = {
+        over: {way: {n: of.tolist() for n, of in ways.items()} for way, ways in both.items()} for over, both in found.items()
+    }
+    kept.write_text(json.dumps(plain))
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--quick", action="store_true", help="one scene, a small pool, no picture")
+    parser.add_argument("--seeds", type=int, default=6)
+    parser.add_argument("--most", type=int, default=256, help="training lightings")
+    parser.add_argument("--only", choices=SCENES, help="one scene, no picture")
+    asked = parser.parse_args()
+    quick = asked.quick
+    seeds, most = (2, 32) if quick else (asked.seeds, asked.most)
+    names = ["cornell"] if quick else [asked.only] if asked.only else list(SCENES)
     print(f"{'scene':13}{'over':10}{'':5}  {'way':11}" + "".join(f"{score:>8}" for score in SCORES) + "   spread of pooled")
-    lightings, points = {}, {}
+    scores = {}
     for name in names:
-        pool = Pool.of(name, pool_size, 64 if quick else 256)
-        lightings[name] = of_lightings(pool, SCENES[name][2], seeds, counts)
-        table(name, "lightings", lightings[name])
-        points[name] = of_points(pool, seeds, places)
-        table(name, "points", points[name])
-        yardstick = 32 if quick else 128
-        aim = mean(lightings[name]["random"][yardstick])[:2]
-        for score, wanted in zip(SCORES, aim, strict=False):
-            place = SCORES.index(score)
-            enough = [count for count, of in lightings[name]["active"].items() if mean(of)[place] <= wanted]
+        scores[name] = scene_scores(name, quick, seeds, most)
+        for over, found in scores[name].items():
+            table(name, over, found)
+        found, yardstick = scores[name]["lightings"], min(128, most)
+        wanted = mean(found["random"][yardstick])
+        for place, score in enumerate(SCORES[:2]):
+            enough = [count for count, of in found["active"].items() if mean(of)[place] <= wanted[place]]
             reached = f"{enough[0]} active ones" if enough else "no number of active ones here"
-            print(f"{name}: {score} error of {yardstick} random lightings ({wanted:.4f}): reached by {reached}", flush=True)
-    if not quick:
-        draw(lightings, points)
+            print(
+                f"{name}: {score} error of {yardstick} random lightings ({wanted[place]:.4f}): reached by {reached}", flush=True
+            )
+    if not quick and not asked.only:
+        draw(*({name: of[over] for name, of in scores.items()} for over in ("lightings", "points")))
         print("docs/active.png")
 
 
 if __name__ == "__main__":
     with threadpool_limits(limits=1, user_api="blas"):
-        main(*sys.argv[1:])
+        main()
