@@ -93,7 +93,8 @@ def test_columns_span_the_greatest_volume_greedily(seed: int) -> None:
 
 
 def test_samples_told_apart_by_too_few_lightings_keep_their_order() -> None:
-    rows = np.random.default_rng(0).normal(size=(3, 10))
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(8, 3)) @ rng.normal(size=(3, 10))  # eight lightings of rank three
     order = choose_columns(rows, 6)
     assert order[3:].tolist() == sorted(set(range(10)) - set(order[:3].tolist()))
     assert choose_columns(np.zeros((3, 4)), 2).tolist() == [0, 1, 2, 3]
