@@ -202,10 +202,15 @@ def draw(lightings: dict, points: dict) -> None:
                     axes.fill_between(list(of), trials.min(1), trials.max(1), color=colours[way], alpha=0.2, linewidth=0)
                     axes.plot(list(of), np.exp(np.log(trials).mean(1)), "o-", color=colours[way], label=way, markersize=3)
             axes.set(xscale="log", yscale="log", xlabel=label, title=name if row == 0 else "")
-            axes.set_xticks(list(of), [str(count) for count in of])
+            counts = list(next(iter(curves.values())))
+            axes.set_xticks(counts, [str(count) for count in counts])
             axes.minorticks_off()
             low, high = axes.get_ylim()
-            ticks = [tick for tick in (0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1, 1.5, 2) if low <= tick <= high]
+            ticks = [
+                tick
+                for tick in (0.05, 0.06, 0.07, 0.08, 0.09, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.7, 0.9, 1, 1.1, 1.3, 1.5, 2)
+                if low <= tick <= high
+            ]
             axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
             axes.grid(alpha=0.3)
         panels[row][0].set_ylabel("held-out relative RMSE")
