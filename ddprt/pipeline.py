@@ -58,7 +58,12 @@ class Run:
         check_names(self.config)
         scene = self.scene
         make_folder(self.folder)
-        data = bake(scene, config=self.config, out=self.folder / "dataset", progress=self.progress)
+        if self.config.lightings.target_error:
+            from ddprt.pipeline_active import bake_to_target
+
+            data = bake_to_target(scene, self.config, self.folder / "dataset", self.progress)
+        else:
+            data = bake(scene, config=self.config, out=self.folder / "dataset", progress=self.progress)
         write_text(self.folder / "config.toml", self.config.to_toml())
         if not any(stage.get("rays") for stage in self.progress.stages):
             self._remember_bake()

@@ -23,6 +23,7 @@ WALK = [
     "report",
     "export",
     "bench",
+    "pipeline_active",
     "pipeline",
     "pipeline_inspect",
     "cli",
