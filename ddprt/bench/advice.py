@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from ddprt.bench.best_fit import best_transfer, projected
@@ -263,13 +264,11 @@ def _size(knob: Knob, model: Model, config: Config) -> dict[str, Any]:
     if not isinstance(model.relighter, LinearTransfer):
         return {"bytes": shipped_bytes(model, precision), "flops": model.relighter.flops}
     groups, bases, inputs = model.relighter.matrix.shape
-    entries, fewer = model.relighter.basis.shape[1], model.relighter
+    entries, now = model.relighter.basis.shape[1], model.relighter
     bases += knob.then - knob.now if knob.setting == "fit.bases" else 0
     inputs *= 2 if knob.cause == "measurement" else 1
-    blank = replace(
-        fewer, matrix=np.zeros((groups, bases, inputs)), offset=np.zeros((groups, inputs)), intercept=np.zeros((groups, bases)),
-        basis=np.broadcast_to(np.float32(0), (bases, entries)),
-    )  # fmt: skip
+    shapes = {"matrix": (groups, bases, inputs), "offset": (groups, inputs), "intercept": (groups, bases)}
+    blank = replace(now, **{name: jnp.zeros(shape) for name, shape in {**shapes, "basis": (bases, entries)}.items()})  # type: ignore[arg-type]
     return {"bytes": shipped_bytes(replace(model, relighter=blank), precision), "flops": blank.flops}
 
 
