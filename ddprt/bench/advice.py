@@ -115,6 +115,7 @@ def record(budget: Budget, model: Model, bakery: Bakery) -> dict[str, Any]:
         "method": model.method,
         "lightings": len(budget.lightings),
         "truth_noise": budget.truth_noise,
+        "chance": budget.chance,
         "scenario": config.budget.scenario,
         **parts.record(),
         "now": {"relative_rmse": float(np.sqrt(max(parts.squared, 0))), "bytes": size, "flops": flops, "bake_seconds": baked},
@@ -176,7 +177,7 @@ def _against_bias(budget: Budget, config: Config) -> Knob | None:
     if now < min(resolution, 1024):
         then, why = min(2 * now, resolution, 1024), "bias falls with the square of the width of what light is averaged over"
         return Knob(cause, "transport.sender_resolution", now, then, _left(budget, cause, (now / then) ** 4), why, True, None)
-    return Knob(cause, "transport.integrator", "operator", "paths", _left(budget, cause, 0), "paths are unbiased", True, None)
+    return Knob(cause, "transport.integrator", "operator", "paths", _left(budget, cause, 0.0), "paths are unbiased", True, None)
 
 
 def _against_truncation(budget: Budget, config: Config) -> Knob | None:
@@ -226,13 +227,13 @@ def _against_scenario(budget: Budget, config: Config) -> Knob | None:
         return None
     now = {key: getattr(config.lightings, key) for key in wanted}
     why = "trained on as held out; what the basis gains is not counted"
-    return Knob(cause, "lightings", now, dict(wanted), _left(budget, cause, 0), why, True)
+    return Knob(cause, "lightings", now, dict(wanted), _left(budget, cause, 0.0), why, True)
 
 
 def _against_quantisation(budget: Budget, config: Config) -> Knob | None:
     if config.export.precision == "float":
         return None
-    expected = _left(budget, "quantisation", 0)
+    expected = _left(budget, "quantisation", 0.0)
     return Knob("quantisation", "export.precision", config.export.precision, "float", expected, "float32 rounds by 6e-8")
 
 

@@ -94,6 +94,14 @@ class Budget:
         noise = (self.truth[0] - self.truth[1]).astype(np.float64) / 2
         return float(np.sqrt(np.einsum("ltc,t->", noise**2, self.weight) / (3 * len(noise))) / self.parts.mean)
 
+    @property
+    def chance(self) -> float:
+        """The share of the squared total by which the truth's noise is expected to shift it, and cross terms with bias.
+
+        Lightings share their paths, so that independent values are as many as texels: 2 ||e|| s / sqrt(texels) over ||e||².
+        """
+        return 2 * self.truth_noise / float(np.sqrt(len(self.weight) * max(self.parts.squared, 1e-30)))
+
 
 def measure_budget(model: Model, bakery: Bakery) -> Budget:
     """Bakes what is needed and takes the error of a model apart.
@@ -139,6 +147,7 @@ def table(document: dict[str, Any]) -> str:
     rows.append(f"{'cross terms':<18}{'':>14}{1 - document['closure']:>15.1%}")
     rows += [f"  {' x '.join(pair['causes']):<30}{pair['share']:>15.1%}" for pair in crossed if abs(pair["share"]) >= 0.0005]
     rows.append(f"{'all':<18}{document['total']['relative_rmse']:>14.3%}{1:>15.1%}")
+    rows.append(f"{'by chance':<18}{'':>14}{document['chance']:>15.1%}  of the truth's noise, {document['truth_noise']:.1%}")
     notes = [] if document["scenario"] else ["scenario shift is exactly 0: [budget] scenario is empty"]
     return "\n".join([*rows, *notes, document["advice"]])
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ddprt.axes import Float, Float32, Float64
+from ddprt.axes import Float32, Float64
 
 Field = Float32[np.ndarray, "lightings texels 3"]
 
@@ -78,7 +78,7 @@ class Parts:
         """Total, parts, cross terms and closure as plain numbers; relative RMSEs and shares of the squared total."""
         whole, square = self.products.sum(), self.mean**2
         parts = [
-            {"cause": cause, "relative_rmse": _root(value / square), "share": float(value / whole)}
+            {"cause": cause, "relative_rmse": _root(float(value) / square), "share": float(value / whole)}
             for cause, value in zip(self.causes, np.diagonal(self.products), strict=True)
         ]
         pairs = [(i, j) for i in range(len(self.causes)) for j in range(i + 1, len(self.causes))]
@@ -118,5 +118,5 @@ def _steps(chain: Sequence[Link], row: int, half: int) -> Float64[np.ndarray, "p
     return fields[:-1] - fields[1:]
 
 
-def _root(square: Float | float) -> float:
+def _root(square: float) -> float:
     return float(np.sqrt(max(float(square), 0.0)))

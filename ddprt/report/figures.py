@@ -281,7 +281,7 @@ def budget_bars(budget: Mapping[str, Any]) -> str:
         for row, (value, share) in enumerate(zip(values, shares, strict=True)):
             axes.annotate(f"{100 * share:.1f} %", (100 * value, row), (4, 0), textcoords="offset points", va="center")
         axes.set(yticks=range(len(rows)), yticklabels=names, xlabel="relative RMSE (%); beside: share of the square")
-        axes.set(xlim=(0, 118 * max(values)))
+        axes.set(xlim=(0, 122 * max(values)))
         axes.invert_yaxis()
         axes.grid(False, axis="y")
         axes.set_position((0.29, 0.15, 0.69, 0.81))
