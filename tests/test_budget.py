@@ -301,3 +301,12 @@ def test_steps_are_told_apart_in_closed_form() -> None:
     assert parts.shrunk("two", 0.25) == pytest.approx(4)
     assert parts.shrunk("three", 0.0) == pytest.approx(9)
     assert parts.part("three") == 0
+
+
+def test_halves_that_differ_leave_nothing_over() -> None:
+    rng = np.random.default_rng(1)
+    draw = lambda: rng.normal(1, 1, (3, 7, 3)).astype(np.float32)  # noqa: E731
+    chain = [Link.sure("one", draw()), Link("two", (draw(), draw())), Link("", (draw(), draw()))]
+    document = take_apart(chain, np.full(7, 1 / 7)).record()
+    shares = [part["share"] for part in document["parts"]] + [pair["share"] for pair in document["cross_terms"]]
+    assert sum(shares) == pytest.approx(1, abs=1e-10)  # float64 sums of 63 products
