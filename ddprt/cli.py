@@ -103,7 +103,13 @@ def evaluate(call: Call) -> None:
     job = call.run()
     data = job.dataset()
     models, seconds = job.fit(data)
-    report = job.report(data, models, job.evaluate(data, models, seconds))
+    evaluation = job.evaluate(data, models, seconds)
+    budget = job.budget(data, models) if call.asks("budget") else None
+    report = job.report(data, models, evaluation, budget=budget)
+    if budget is not None:
+        from ddprt.bench.budget import table
+
+        print(f"{table(budget)}\nbudget:   {job.folder / 'budget.json'}")
     print(f"metrics:  {job.folder / 'metrics.json'}\nreport:   {report}")
 
 
@@ -209,7 +215,9 @@ VERBS = {
     "inspect": Verb(inspect, "FILE.toml|SCENE|MESH"),
     "bake": Verb(bake, options=_OUT),
     "fit": Verb(fit, options=_OUT),
-    "eval": Verb(evaluate, options=_OUT),
+    "eval": Verb(
+        evaluate, options=_OUT, flags={"budget": "  take the error apart by its causes (section [budget]); bakes more"}
+    ),
     "relight": Verb(
         relight,
         "MODEL",

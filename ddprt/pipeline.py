@@ -151,8 +151,20 @@ class Run:
         write_text(self.folder / "metrics.json", json.dumps(evaluation.metrics, indent=1, allow_nan=False) + "\n")
         return evaluation
 
-    def report(self, data: Dataset, models: dict[str, Any], evaluation: Any) -> Path:
-        """Writes report.html."""
+    def budget(self, data: Dataset, models: dict[str, Any]) -> dict[str, Any]:
+        """Takes the error of the main model apart, and writes budget.json; its bakes stay in the folder `budget`."""
+        from ddprt.bench.advice import record
+        from ddprt.bench.budget import measure_budget
+        from ddprt.bench.yardsticks import Bakery
+
+        bakery = Bakery(self.scene, self.config, data, self.folder / "budget", self.progress)
+        model = next(iter(models.values()))
+        document = record(measure_budget(model, bakery), model, bakery)
+        write_text(self.folder / "budget.json", json.dumps(document, indent=1, allow_nan=False) + "\n")
+        return document
+
+    def report(self, data: Dataset, models: dict[str, Any], evaluation: Any, *, budget: dict[str, Any] | None = None) -> Path:
+        """Writes report.html; `budget` is what `Run.budget` gave."""
         from ddprt.report.page import write_page
 
         path = self.folder / "report.html"
@@ -168,6 +180,7 @@ class Run:
                 plan_effects=self.effects(data).effects,
                 effect_costs={str(row["name"]): row for row in self.costs(data)},
                 command=self.command,
+                budget=budget,
             )
         return path
 
