@@ -67,7 +67,6 @@ class Run:
 
     def forecast(self) -> Forecast:
         """What `bake` would take from nothing; samples of files are written beside the folder of the run, and removed."""
-
         begun = time.perf_counter()
         from ddprt.methods.names import check_names  # takes its time, as it will when the bake begins
 

@@ -10,7 +10,7 @@ import numpy as np
 from ddprt import seeds
 from ddprt.axes import Float32, Int
 from ddprt.dataset.denoise import denoised
-from ddprt.dataset.sampled import Expected, Part, Sampled, extrapolated, on_a_line
+from ddprt.dataset.sampled import Expected, Number, Part, Sampled, extrapolated, on_a_line
 from ddprt.dataset.scratch import Scratch
 from ddprt.dataset.store import map_name, read_map, write_map
 from ddprt.lights import Lighting
@@ -160,7 +160,7 @@ def _by_paths(job: Sampled, split: str, indices: list[int], seen: list[int], par
     sizes = [min(count, size) for size in _SHADED]
     shaded = [[job.lightings[indices[place]] for place in np.linspace(0, count - 1, size).astype(int)] for size in sizes]
 
-    def line(work: Callable[[list[Lighting]], Any]) -> tuple[float, float, Any]:
+    def line(work: Callable[[list[Lighting]], Any]) -> tuple[Number, Number, Any]:
         """Seconds and rays of all lightings, and what the larger number gave; the smaller goes first once to load."""
         found, results = [], []
         for lightings in (shaded[0], *shaded):
@@ -168,7 +168,8 @@ def _by_paths(job: Sampled, split: str, indices: list[int], seen: list[int], par
             results.append(work(lightings))
             found.append((time.perf_counter() - begun, job.tracer.rays - before))
         cold, *warm = found
-        seconds, rays = (on_a_line(*zip(sizes, values, strict=True), count) for values in zip(*warm, strict=True))
+        few, many = sizes
+        seconds, rays = (on_a_line((few, low), (many, high), count) for low, high in zip(*warm, strict=True))
         return seconds + max(0.0, cold[0] - warm[0][0]), rays, results[-1]
 
     scene = job.tracer, job.scene, atlas
@@ -233,7 +234,7 @@ def _looked(job: Sampled, seen: list[int], noise: float) -> _Look:
     return _Look(operator, operator.bounce(direct, seed=job.config.seed, stream="look", bounces=1).radiosity, noise)
 
 
-def _scratched(job: Sampled, size: float) -> float:
+def _scratched(job: Sampled, size: Number) -> float:
     """Seconds that the disk takes for so many bytes of maps in the making."""
     texels = max(1, int(min(size, _SCRATCH)) // 12)
     noise = seeds.stream(0, "scratched").random((1, texels, 3), np.float32)

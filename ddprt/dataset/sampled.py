@@ -18,6 +18,7 @@ from ddprt.transport.embree import Tracer
 
 PATIENCE = 0.7  # seconds after which no further sample of a kind is taken
 
+Number = float | int
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -50,7 +51,7 @@ class Part:
     then: float
 
 
-def extrapolated(spent: Sequence[tuple[float, float]], whole: float) -> float:
+def extrapolated(spent: Sequence[tuple[Number, Number]], whole: Number) -> float:
     """Seconds of work from rounds of it: the first, which also loads and compiles, and the rate of all others.
 
     Args:
@@ -60,13 +61,13 @@ def extrapolated(spent: Sequence[tuple[float, float]], whole: float) -> float:
     (first, cold), *others = spent
     done = sum(size for size, _ in others)
     rate = sum(seconds for _, seconds in others) / done if done else cold / first
-    return cold + (whole - first) * rate
+    return float(cold + (whole - first) * rate)
 
 
-def on_a_line(one: tuple[float, float], other: tuple[float, float], at: float) -> float:
+def on_a_line(one: tuple[Number, Number], other: tuple[Number, Number], at: Number) -> float:
     """What a constant and something for each come to, from two measurements of (number, seconds); numbers cost, at least 0."""
     (few, low), (many, high) = one, other
-    return high + (at - many) * max(high - low, 0.0) / (many - few) if many > few else high * at / many
+    return float(high + (at - many) * max(high - low, 0.0) / (many - few) if many > few else high * at / many)
 
 
 @dataclass
@@ -93,8 +94,8 @@ class Sampled:
         self,
         work: Callable[[Item], Result],
         items: Sequence[Item],
-        whole: float,
-        size: Callable[[Item], float] = lambda item: 1.0,
+        whole: Number,
+        size: Callable[[Item], Number] = lambda item: 1.0,
         names: Callable[[Item], Sequence[str]] = lambda item: (),
         least: int = 0,
     ) -> tuple[float, list[Result]]:
@@ -111,7 +112,7 @@ class Sampled:
           Seconds of the whole, and what was done.
         """
         results: list[Result] = []
-        spent: list[tuple[float, float]] = []
+        spent: list[tuple[Number, Number]] = []
         step = self.tracer.threads
         while len(results) < len(items) and (
             len(spent) < 2 or len(results) < least or sum(seconds for _, seconds in spent) < PATIENCE
@@ -130,7 +131,7 @@ class Sampled:
         """Bytes of files that the manifest names."""
         return sum(self.manifest.entries[name]["bytes"] for name in names)
 
-    def holds(self, *sizes: float) -> None:
+    def holds(self, *sizes: Number) -> None:
         """So many bytes are needed beside what is held now."""
         self.peak = max(self.peak, resident() + sum(sizes) / 2**30)
 
