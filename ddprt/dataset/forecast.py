@@ -174,8 +174,8 @@ def _foreseen(scene: Scene, config: Config, folder: Path, progress: Progress, be
     stages.append(Expected("files", between, 0, named + 2, described + listing))
     lamps = [sum(map(len, (lightings[index] for index in part))) for part in (train, test)]
     held_out = stages[-2].seconds + reading * len(test) + direct.seconds * lamps[1] / sum(lamps)
-    parts.sort(key=lambda part: -part.seconds)
-    return Forecast(tuple(stages), sum(stage.seconds for stage in stages) - held_out, job.peak, tuple(parts), 0.0)
+    shorter = sorted((part for part in parts if part.then < part.seconds), key=lambda part: -part.seconds)
+    return Forecast(tuple(stages), sum(stage.seconds for stage in stages) - held_out, job.peak, tuple(shorter), 0.0)
 
 
 def _depth(config: Config, spacing: float, lightings: list[Lighting], tracer: Tracer, listed: bool) -> float:

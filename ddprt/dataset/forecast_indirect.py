@@ -59,7 +59,8 @@ def expect_indirect(job: Sampled, split: str, indices: list[int], seen: list[int
         seconds, rays, look = by(job, split, indices, seen, parts)
     storing, size = _stored(job, kinds, indices, look)
     side = job.config.atlas.resolution
-    parts.append(Part(f"files of {_NAMES[split]} maps", storing, f"atlas.resolution = {side // 2}", storing / 4))
+    if side >= 16:  # half of it must be a resolution too
+        parts.append(Part(f"files of {_NAMES[split]} maps", storing, f"atlas.resolution = {side // 2}", storing / 4))
     return Expected(f"indirect {split}", seconds + storing, rays, len(kinds) * len(indices), size), parts
 
 
