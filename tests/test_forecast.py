@@ -64,14 +64,30 @@ def test_columns_cost_a_constant_and_each_the_same() -> None:
     assert on_a_line((3, 1.0), (3, 2.0), 3) == 2.0
 
 
-def test_what_is_known_beforehand_is_told_exactly(tmp_path: Path) -> None:
+class RayClock:
+    """A clock that only rays move, a microsecond each: what it tells does not depend on what else the machine does."""
+
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        self.rays, count = 0, Tracer._count
+
+        def counted(tracer: Tracer, rays: int) -> None:
+            count(tracer, rays)
+            self.rays += rays
+
+        patch.setattr(Tracer, "_count", counted)
+        patch.setattr(time, "perf_counter", lambda: self.rays / 1e6)
+
+
+def test_what_is_known_beforehand_is_told_exactly(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Where all lightings are looked at and no sender is near, the forecast traces what the bake does."""
+    RayClock(monkeypatch)
     config = config_of(transport={"samples": "auto", "test_samples": "auto", "target_noise": 0.1})
     found, stages, files = both(config, tmp_path)
     assert [stage.name for stage in found.stages] == [*stages, "files"]
     told = {stage.name: stage for stage in found.stages}
     for name in ("direct", "indirect train", "indirect test"):
         assert told[name].rays == stages[name]["rays"], name
+        assert told[name].seconds == pytest.approx(float(stages[name]["seconds"]), abs=1e-4), "a stage's seconds have 4 digits"
     assert {name: told[name].files for name in files} == {name: count for name, (count, _) in files.items()}
     assert found.files == sum(count for count, _ in files.values())
     assert told["direct"].bytes == files["direct"][1]
@@ -96,20 +112,6 @@ def test_files_and_rays_come_as_foretold(scene: str, transport: dict[str, Any], 
         assert told[name].bytes == pytest.approx(size, rel=0.25), name  # what issue 5 asks for
     for name in ("direct", "indirect train", "indirect test"):  # all lightings are seen; near senders and roulette: see below
         assert told[name].rays == pytest.approx(stages[name]["rays"], rel=0.1), name
-
-
-class RayClock:
-    """A clock that only rays move, a microsecond each: what it tells does not depend on what else the machine does."""
-
-    def __init__(self, patch: pytest.MonkeyPatch) -> None:
-        self.rays, count = 0, Tracer._count
-
-        def counted(tracer: Tracer, rays: int) -> None:
-            count(tracer, rays)
-            self.rays += rays
-
-        patch.setattr(Tracer, "_count", counted)
-        patch.setattr(time, "perf_counter", lambda: self.rays / 1e6)
 
 
 @pytest.mark.parametrize(
