@@ -86,6 +86,9 @@ def inspect(call: Call) -> None:
 def bake(call: Call) -> None:
     """render the dataset of direct and indirect lightmaps"""
     job = call.run()
+    if call.asks("dry-run"):
+        print(job.forecast())
+        return
     data = job.bake()
     job.record(data)
     print(f"dataset:  {data.folder}")
@@ -213,7 +216,7 @@ _OUT = {"out": "DIR  folder of the run (default: runs/NAME)"}
 VERBS = {
     "run": Verb(run, options=_OUT),
     "inspect": Verb(inspect, "FILE.toml|SCENE|MESH"),
-    "bake": Verb(bake, options=_OUT),
+    "bake": Verb(bake, options=_OUT, flags={"dry-run": "tell seconds, rays, files and memory beforehand; writes nothing"}),
     "fit": Verb(fit, options=_OUT),
     "eval": Verb(
         evaluate, options=_OUT, flags={"budget": "  take the error apart by its causes (section [budget]); bakes more"}

@@ -11,6 +11,7 @@ import numpy as np
 
 from ddprt import __version__
 from ddprt.config import Config
+from ddprt.dataset.forecast import Forecast, forecast
 from ddprt.dataset.generate import bake, other_settings
 from ddprt.dataset.store import Dataset, open_dataset
 from ddprt.errors import UserError
@@ -68,6 +69,16 @@ class Run:
         if not any(stage.get("rays") for stage in self.progress.stages):
             self._remember_bake()
         return data
+
+    def forecast(self) -> Forecast:
+        """What `bake` would take from nothing; samples of files are written beside the folder of the run, and removed."""
+        begun = time.perf_counter()
+        from ddprt.methods.names import check_names  # takes its time, as it will when the bake begins
+
+        check_names(self.config)
+        scene, loading = self.scene, time.perf_counter() - begun
+        beside = next(path for path in self.folder.absolute().parents if path.is_dir())
+        return forecast(scene, self.config, self.progress, beside=beside, loading=loading)
 
     def _remember_bake(self) -> None:
         """Takes the stages of the bake from an earlier run.json where this run found everything baked."""
