@@ -1,6 +1,6 @@
 """What a frame and a bake cost, stage by stage: the paper's Table 1.
 
-Question: how long does it take to shade the measurement points, to make u = M x and to compose y = U u, with 4, 16 and 64 bases,
+Question: how long does it take to shade the measurement points, to make u = M x and to compose y = U u of 4, 16 and 64 bases,
           on the CPU and through JAX on a GPU where there is one? And how long is a bake of 128 lightings?
 Command:  python experiments/paper_table1.py            minutes
           python experiments/paper_table1.py --quick    small bakes, a lightmap of 256² instead of 1024²
