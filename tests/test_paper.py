@@ -58,8 +58,7 @@ def test_no_reading_of_the_paper_gives_its_matrix() -> None:
     ]
 
 
-@pytest.mark.parametrize("channels", ["mono", "multi"])
-@pytest.mark.parametrize("precision", ["half", "float"])
+@pytest.mark.parametrize(("channels", "precision"), [("mono", "half"), ("multi", "float")])
 def test_counted_bytes_are_those_of_an_export(data: Dataset, tmp_path: Path, channels: str, precision: str) -> None:
     model = ddprt.fit(data, bases=6, points=12, channels=channels)
     found = storage.on_disk(model, tmp_path, precision)
@@ -69,11 +68,8 @@ def test_counted_bytes_are_those_of_an_export(data: Dataset, tmp_path: Path, cha
     # One matrix of interleaved colours is as large as three of one; the rest is offset, intercept and a header.
     assert 0 < found["matrices"] - storage.matrix_bytes(6, 12, matrices=3) < 1024
     assert sum(found.values()) == sum(path.stat().st_size for path in tmp_path.iterdir())
-
-
-def test_half_textures_are_smaller_on_disk(plain: Model, tmp_path: Path) -> None:
-    half, whole = (storage.on_disk(plain, tmp_path / name, name) for name in ("half", "float"))
-    assert half.pop("textures") < whole.pop("textures")
+    rounded = all(np.array_equal(image, image.astype(np.float16)) for image in images)
+    assert rounded == (precision == "half")
 
 
 def test_error_of_the_paper_is_a_mean_over_lightings() -> None:
@@ -88,20 +84,20 @@ def test_unit_is_the_norm_without_the_number_of_points(data: Dataset, held: figu
     np.testing.assert_allclose(held.unit * np.sqrt(12 * 3), norm, rtol=1e-12)
 
 
-@pytest.mark.parametrize("label", list(figures.ENCODINGS))
+@pytest.mark.parametrize("label", ["linear mono", "gamma multi"])
 def test_projection_is_that_of_the_report(data: Dataset, held: figures.Held, label: str) -> None:
-    model = figures.fit(data, "ours", figures.ENCODINGS[label], bases=8)
-    for bases in (3, 8):
+    model = figures.fit(data, "ours", figures.ENCODINGS[label], bases=6)
+    for bases in (3, 6):
         short = figures.shortened(model, bases)
         assert short is not None
         _, ours = held.errors(figures.projected(short, held, data.area))
-        # Float32 rounds a sum of 8 products to 1e-6 of the light, so an error of a hundredth of it to 1e-4.
+        # Float32 rounds a sum of 6 products to 1e-6 of the light, so an error of a hundredth of it to 1e-4.
         assert ours > 0.01
         assert ours == pytest.approx(projection_error(data, model, held.truth, bases), rel=1e-4)
 
 
 def test_projection_keeps_what_the_basis_spans(data: Dataset, held: figures.Held) -> None:
-    model = figures.fit(data, "paper", figures.ENCODINGS["linear mono"], bases=5)
+    model = figures.fit(data, "paper", figures.ENCODINGS["linear mono"], bases=6)
     relighter = model.relighter
     scale = np.asarray(model.encoding.scale(jnp.asarray(held.values)))
     inside = relighter.mean + 0.1 * relighter.basis[0] / np.abs(relighter.basis[0]).max() * np.asarray(relighter.mean).min()
@@ -128,7 +124,7 @@ def test_mean_counts_as_a_base(data: Dataset) -> None:
     assert figures.shortened(model, 7) is None
 
 
-@pytest.mark.parametrize("label", ["linear mono", "linear multi", "gamma mono"])
+@pytest.mark.parametrize("label", ["linear mono", "gamma multi"])
 def test_as_it_reads_solves_its_normal_equations(data: Dataset, label: str) -> None:
     encoding = figures.ENCODINGS[label]
     model = figures.fit(data, "as read", encoding, bases=6)
@@ -152,7 +148,7 @@ def test_as_it_reads_solves_its_normal_equations(data: Dataset, label: str) -> N
 
 
 def test_eigenvalues_are_those_of_the_autocorrelation(data: Dataset) -> None:
-    model = figures.fit(data, "ours", figures.ENCODINGS["linear multi"], bases=4)
+    model = figures.fit(data, "ours", figures.ENCODINGS["linear multi"], bases=6)
     train = data.split("train")
     values, light = data.values(train, 12, "radiosity").astype(np.float64), data.maps("indirect", train).astype(np.float64)
     columns = light / np.sqrt(np.sum(values**2, (1, 2), keepdims=True))
