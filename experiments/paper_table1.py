@@ -8,7 +8,8 @@ Answer:   docs/paper.md
 
 fake G-buffer  `Model.measure`: shadow rays from 256 points of 8 samples each to one point lamp, and their means; always on the
                CPU (Embree)
-transfer       scale and encode 256 values per channel, and u = M x for three channels, from host memory to host memory
+transfer       scale and encode 256 values per channel, and u = M x for three channels, from host memory to host memory: by
+               `Model.coefficients`, which is compiled for the CPU, and by JAX on the device
 compose        y = U u for all three channels of every texel of the lightmap, scaled and clamped, in the device's memory; bytes
                are those that must be read and written once
 frame          `Model.predict`, which is both and copies the lightmap to the host
@@ -40,6 +41,7 @@ from ddprt.runtime.model import Model
 
 BASES = (4, 16, 64)
 REPEATS = 101
+CALLS = 100  # in one timing of what takes but microseconds itself
 HELD_OUT = {"indirect validation", "indirect test"}
 PAPER = {  # microseconds of the fragment shader: Cornell, Viking, Dragon, Hairball
     "No GI": (221, 232, 418, 8729),
@@ -108,17 +110,17 @@ _WARM: set[str] = set()
 def frames(model: Model, values: np.ndarray, side: int, place: Any) -> None:
     """Transfer, composition and both, on one device."""
     print(f"\n{place.platform} ({place.device_kind}): {side}² texels, {model.points} points, RGB, mono channel; quartiles")
-    print(
-        "| bases | transfer µs | compose µs | bytes through memory | GB/s | frame µs |\n| --- | --- | --- | --- | --- | --- |"
-    )
+    print("| bases | transfer µs | by JAX µs | compose µs | bytes through memory | GB/s | frame µs |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
     for bases in BASES:
         wide = widened(model, bases, side * side)
+        _, quick = timed(lambda wide=wide: [wide.coefficients(values) for _ in range(CALLS)], REPEATS)
         u, transfer = timed(lambda wide=wide: np.asarray(coefficients(wide, values)), REPEATS)
         on_device = jnp.asarray(u), wide.encoding.scale(jnp.asarray(values[None]))
         _, composing = timed(lambda wide=wide, given=on_device: _compose(wide.relighter, wide.encoding, *given), REPEATS)
         _, whole = timed(lambda wide=wide: wide.predict(values), REPEATS)
         moved = composed_bytes(bases, side * side)
-        print(f"| {bases} | {micro(transfer)} | {micro(composing)} | {moved / 1e6:.1f} MB | ", end="")
+        print(f"| {bases} | {micro(quick, CALLS)} | {micro(transfer)} | {micro(composing)} | {moved / 1e6:.1f} MB | ", end="")
         print(f"{moved / composing.median / 1e9:.1f} | {micro(whole)} |", flush=True)
 
 
@@ -137,7 +139,7 @@ def composed_bytes(bases: int, texels: int) -> int:
 
 
 def coefficients(model: Model, values: np.ndarray) -> jax.Array:
-    """u of one frame, (1, rgb, bases)."""
+    """u of one frame by JAX, (1, rgb, bases), without the frame's scale."""
     return _coefficients(model.relighter, model.encoding, jnp.asarray(values[None]))
 
 
@@ -153,8 +155,10 @@ def _compose(relighter: LinearTransfer, encoding: Encoding, u: jax.Array, scale:
     return encoding.decode(jnp.moveaxis(light, 1, 2), scale)
 
 
-def micro(seconds: Timing) -> str:
-    return f"{seconds.median * 1e6:.0f} ({seconds.low * 1e6:.0f} to {seconds.high * 1e6:.0f})"
+def micro(seconds: Timing, calls: int = 1) -> str:
+    median, low, high = (value * 1e6 / calls for value in (seconds.median, seconds.low, seconds.high))
+    digits = 0 if median >= 100 else 1
+    return f"{median:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
 
 
 if __name__ == "__main__":

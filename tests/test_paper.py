@@ -169,6 +169,8 @@ def test_coefficients_of_a_frame(plain: Model, held: figures.Held) -> None:
     x = held.values[0].astype(np.float64)
     expected = [np.asarray(wide.relighter.matrix[c], np.float64) @ x[:, c] / np.linalg.norm(x[:, c]) for c in range(3)]
     np.testing.assert_allclose(table1.coefficients(wide, held.values[0])[0], expected, atol=1e-5)  # 12 float32 products
+    scaled = np.array(expected) * np.linalg.norm(x, axis=0)[:, None]  # the other way that is timed has the scale in it
+    np.testing.assert_allclose(wide.coefficients(held.values[0]), scaled, atol=1e-5 * np.linalg.norm(x))
 
 
 def test_composition_answers_as_the_model(plain: Model, held: figures.Held) -> None:
