@@ -290,8 +290,8 @@ def draw_bases(curves: dict[tuple[str, str, str], list[Any]], floors: dict[str, 
         axes.set_xticks([], minor=True)
         axes.grid(alpha=0.3, which="both")
     for row in panels:
-        low = min(axes.get_ylim()[0] for axes in row)
-        high = max(axes.get_ylim()[1] for axes in row)
+        low = min(axes.get_ylim()[0] for axes in row if axes.lines)
+        high = max(axes.get_ylim()[1] for axes in row if axes.lines)
         for axes in row:
             axes.set_ylim(low, high)
     styles = [Line2D([], [], color="#222222", label="transfer")]
