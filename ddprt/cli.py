@@ -116,6 +116,52 @@ def evaluate(call: Call) -> None:
     print(f"metrics:  {job.folder / 'metrics.json'}\nreport:   {report}")
 
 
+def bench(call: Call) -> None:
+    """try settings about a configuration: error against seconds, bytes and memory"""
+    if call.asks("peers"):
+        return peers(call)
+    if call.asks("quick"):
+        raise UserError("--quick: got no --peers, which it belongs to; a sweep is shortened by --sweep.SECTION.KEY")
+    results, page, *others = call.run().sweep()
+    print(f"results:  {results}\npage:     {page}\nfigures:  {others[-1].parent}")
+    return None
+
+
+def peers(call: Call) -> None:
+    """Our fit, transfer and relighting beside everyone else's."""
+    from ddprt.bench.peers import peers, table
+    from ddprt.config import load_config
+    from ddprt.files import make_folder, write_text
+    from ddprt.progress import Progress
+
+    config = load_config(call.file("a configuration, or nothing") if call.files else None, call.overrides)
+    record = peers(config, Progress(call.quiet), quick=call.asks("quick"))
+    print(table(record))
+    if "out" in call.options:
+        import json
+
+        folder = Path(call.options["out"])
+        make_folder(folder)
+        write_text(folder / "peers.json", json.dumps(record, indent=1, allow_nan=False) + "\n")
+        print(f"record:   {folder / 'peers.json'}")
+
+
+def tune(call: Call) -> None:
+    """find the setting that meets a budget of error, time and bytes, with few trials"""
+    from ddprt.bench.tune import told
+
+    call.overrides |= {f"tune.{key.replace('-', '_')}": call.options[key] for key in _LIMITS if key in call.options}
+    job = call.run()
+    outcome = job.tune()
+    print(told(outcome))
+    if not outcome.met:
+        raise UserError(
+            f"ddprt tune: got a budget that no setting meets, {outcome.binding} stands in the way; "
+            f"raise --max-{outcome.binding.replace('_', '-')}, or take {job.folder / 'tune' / 'nearest.toml'}"
+        )
+    print(f"config:   {job.folder / 'tune' / 'tuned.toml'}")
+
+
 def relight(call: Call) -> None:
     """turn a lighting into an indirect lightmap: ddprt relight MODEL --lighting lights.json --out relit.exr"""
     import json
@@ -213,6 +259,13 @@ class Verb:
 
 
 _OUT = {"out": "DIR  folder of the run (default: runs/NAME)"}
+_LIMITS = {
+    "max-relative-rmse": "X  most error on held-out lightings",
+    "max-frame-us": "X  most microseconds to relight a frame",
+    "max-megabytes": "X  most 10^6 bytes that ship",
+    "max-bake-seconds": "X  most seconds to bake what is learned from",
+    "max-fit-seconds": "X  most seconds to fit",
+}
 VERBS = {
     "run": Verb(run, options=_OUT),
     "inspect": Verb(inspect, "FILE.toml|SCENE|MESH"),
@@ -221,6 +274,15 @@ VERBS = {
     "eval": Verb(
         evaluate, options=_OUT, flags={"budget": "  take the error apart by its causes (section [budget]); bakes more"}
     ),
+    "bench": Verb(
+        bench,
+        options=_OUT,
+        flags={
+            "peers": "compare fit, transfer and relighting with other libraries; FILE may be left out",
+            "quick": "less of it",
+        },
+    ),
+    "tune": Verb(tune, options=_OUT | _LIMITS),
     "relight": Verb(
         relight,
         "MODEL",
@@ -231,7 +293,7 @@ VERBS = {
     "verify": Verb(verify, "DIR", configured=False),
     "doctor": Verb(doctor, "", configured=False),
 }
-LATER = {"bench", "tune", "import", "view", "status"}
+LATER = {"import", "view", "status"}
 FLAGS = {"quiet": "no progress", "debug": "tracebacks instead of one-line errors"}
 
 

@@ -206,6 +206,18 @@ class Run:
             self.progress.warn(f"export.stitch: seams stay open: {seams['why']}")
         return files
 
+    def sweep(self) -> list[Path]:
+        """Tries settings about the configuration (`ddprt bench`); returns the results and what shows them."""
+        from ddprt.bench.frontier import sweep
+
+        return sweep(self.config, self.folder / "bench", self.progress)
+
+    def tune(self) -> Any:
+        """Searches a setting within the limits of [tune]; see `ddprt.bench.tune.Outcome`."""
+        from ddprt.bench.tune import tune
+
+        return tune(self.config, self.folder / "tune", self.progress)
+
     def effects(self, data: Dataset) -> Plan:
         """The plan that the dataset was baked under."""
         return plan(self.scene, data.lightings, bounces=self.config.transport.bounces)

@@ -159,6 +159,18 @@ class Yardstick:
             "unseen_lightings": unseen,
         }
 
+    @threadpool_limits.wrap(limits=1, user_api="blas")
+    def tally(self, model: Model) -> Tally:
+        """The errors of `score` alone, lighting by lighting; quicker.
+
+        Raises:
+          UserError: as for `score`.
+        """
+        values, tallies = self.measured(model), []
+        for row, index in enumerate(self.held_out):
+            tallies.append(self._truth(index).tally(self._carry(model, model.predict(values[row])[None])))
+        return Tally.joined(tallies)
+
     @cached_property
     def noise(self) -> float | None:
         """Relative RMSE that the truth's own noise makes: of half differences; None where it is black."""
