@@ -25,7 +25,7 @@ from ddprt.progress import Doubt
 
 FOLDER = "pack"
 _SCHEMA = 1
-_TYPES = {"f16": np.dtype("<f2"), "f32": np.dtype("<f4")}
+_TYPES: dict[str, np.dtype[Any]] = {"f16": np.dtype("<f2"), "f32": np.dtype("<f4")}
 
 Stored = tuple[Float32[np.ndarray, "height width 3"], int]
 """A map as it is stored, and its exposure: light is stored * 2**exposure."""
@@ -59,8 +59,8 @@ class Pack:
 
     def untouched(self, names: Sequence[str] | None = None) -> bool:
         """Whether files that it was made from (all, if none are named) have neither changed nor gone since it was opened."""
-        root, names = self.path.parent.parent, self._seen if names is None else names
-        return all(_stamp(root / name) == self._seen.get(name) for name in names) and _stamp(self.path)[0] == self.nbytes
+        root, asked = self.path.parent.parent, list(self._seen) if names is None else names
+        return all(_stamp(root / name) == self._seen.get(name) for name in asked) and _stamp(self.path)[0] == self.nbytes
 
     def read(self, rows: Sequence[int], start: int = 0, stop: int | None = None) -> Float32[np.ndarray, "lightings texels 3"]:
         """Light of some lightings at the texels from `start` to `stop`, W/m².
@@ -94,7 +94,7 @@ class Pack:
             os.close(self._file)
 
     def _fill(self, place: np.ndarray, offset: int) -> None:
-        left = memoryview(place.reshape(-1).view(np.uint8))
+        left = memoryview(place.reshape(-1).view(np.uint8))  # type: ignore[arg-type]
         try:
             while left and (got := os.preadv(self._file, [left], offset)):
                 left, offset = left[got:], offset + got

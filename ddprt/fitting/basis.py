@@ -283,8 +283,9 @@ def _blocks(columns: Array | Columns) -> Iterator[Array]:
 
 
 def _cut(array: Array | None, start: int, size: int) -> Array | None:
-    whole = array is None or size == array.shape[-1]
-    return array if whole else jax.lax.dynamic_slice_in_dim(array, start, size, -1)
+    if array is None or size == array.shape[-1]:
+        return array
+    return jax.lax.dynamic_slice_in_dim(array, start, size, -1)
 
 
 def _over_tiles(add: Callable[..., Any], total: Any, *arrays: Array | None) -> Any:
