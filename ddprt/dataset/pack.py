@@ -25,6 +25,7 @@ from ddprt.progress import Doubt
 
 FOLDER = "pack"
 _SCHEMA = 1
+_NORMAL = 127  # from here on a power of two is no normal float32
 _TYPES: dict[str, np.dtype[Any]] = {"f16": np.dtype("<f2"), "f32": np.dtype("<f4")}
 
 Stored = tuple[Float32[np.ndarray, "height width 3"], int]
@@ -75,7 +76,11 @@ class Pack:
         stored = np.empty(light.shape[1:], self.dtype)
         for place, row in zip(light, rows, strict=True):
             self._fill(stored, row * self._row + start * 3 * self.dtype.itemsize)
-            np.ldexp(stored.astype(np.float32), self.exposures[row], out=place)
+            exposure = self.exposures[row]
+            if abs(exposure) < _NORMAL:  # rounded as ldexp rounds, in a third of the time
+                np.multiply(stored, np.float32(2.0**exposure), out=place, dtype=np.float32)
+            else:
+                np.ldexp(stored.astype(np.float32), exposure, out=place)
         return light
 
     def expect(self, rows: Sequence[int], start: int, stop: int) -> None:
@@ -169,7 +174,7 @@ def open_pack(folder: Path, kind: str, sources: Mapping[str, Mapping[str, Any]])
     header = folder / FOLDER / f"{kind}.json"
     try:
         entry = json.loads(header.read_text("utf-8"))
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, ValueError):
         return f"{header.name} cannot be read"
