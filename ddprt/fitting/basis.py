@@ -297,7 +297,9 @@ def _over_tiles(add: Callable[..., Any], total: Any, *arrays: Array | None) -> A
         tile = jax.tree.map(lambda array: jax.lax.dynamic_slice_in_dim(array, i * _TILE, _TILE, -1), arrays)
         return add(total, i * _TILE, *tile)
 
-    total = jax.lax.fori_loop(0, whole // _TILE, step, total) if whole else total
+    # A loop of one round would be taken apart and its last bits would be others: they must not tell how many tiles a block has.
+    rounds = jax.lax.optimization_barrier(jnp.asarray(1)) if whole == _TILE else whole // _TILE
+    total = jax.lax.fori_loop(0, rounds, step, total) if whole else total
     return add(total, whole, *jax.tree.map(lambda array: array[..., whole:], arrays)) if entries > whole else total
 
 
