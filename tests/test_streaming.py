@@ -25,7 +25,6 @@ from ddprt.errors import UserError
 from ddprt.fitting import basis as bases
 from ddprt.fitting.basis import Basis, fit_basis
 from ddprt.fitting.encoding import Encoding
-from ddprt.lights import parse_lighting
 from ddprt.methods.method import Maps, found_in, in_memory
 from ddprt.runtime import train, trust
 from ddprt.runtime.model import Model
@@ -39,15 +38,9 @@ EPS = float(np.finfo(np.float32).eps)
 def data(cornell: Scene, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """A box of 5128 texels or so: with 8 lightings, six tiles of which the last is not whole."""
     out = tmp_path_factory.mktemp("streaming") / "dataset"
-    lamps = [
-        [{"type": "point", "position": [0.2 + 0.04 * i, 0.5 + 0.3 * (i % 2), 0.9 - 0.05 * i], "intensity": [1, 0.8, 0.1 * i]}]
-        for i in range(14)
-    ]
-    config = load_config(None, {"atlas.resolution": "80", "points.count": "24", "points.supersample": "1"})
-    given = {"train": lamps[:8], "validation": lamps[8:12], "test": lamps[12:]}
-    return bake(
-        cornell, {name: [parse_lighting(lamp) for lamp in part] for name, part in given.items()}, config=config, out=out
-    )
+    few = {"lightings.train": "8", "lightings.validation": "4", "lightings.test": "2"}
+    config = load_config(None, {"atlas.resolution": "80", "points.count": "24", "points.supersample": "1", **few})
+    return bake(cornell, config=config, out=out)
 
 
 @pytest.fixture

@@ -149,7 +149,7 @@ def _sharpen(
 def _squared_part(
     first: int, last: int, rotation: Array, gram: _Gram, columns: Array, weights: Array, mean: Array | None
 ) -> _Gram:
-    deep = rotation[:, first:last].T
+    deep = jax.lax.optimization_barrier(rotation[:, first:last].T)
 
     def add(gram: _Gram, start: Array | int, columns: Array, weights: Array, mean: Array | None) -> _Gram:
         part = jnp.matmul(deep, _centred(columns, mean), precision="highest")
@@ -201,7 +201,7 @@ def _projected(
     overlap: Array, sigma: Array, rotation: Array, columns: Array, weights: Array, mean: Array | None
 ) -> tuple[Array, Array]:
     """Vectors of a block, nearly orthonormal, and the overlap with what the block adds to it."""
-    turn = (rotation / sigma).T
+    turn = jax.lax.optimization_barrier((rotation / sigma).T)  # its layout must not hang on how many tiles there are
 
     def add(
         total: tuple[Array, Array], start: Array | int, columns: Array, weights: Array, mean: Array | None
