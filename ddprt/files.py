@@ -133,6 +133,28 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, "utf-8")
 
 
+def append_line(path: Path, line: str) -> None:
+    """Adds a line to a file and sees it to the disk; what a killed process left of its own line stays a line apart.
+
+    Raises:
+      UserError: the file cannot be written.
+    """
+    try:
+        with path.open("a+b") as file:
+            end = file.seek(0, os.SEEK_END)
+            whole = end == 0
+            if end:
+                file.seek(end - 1)
+                whole = file.read(1) == b"\n"
+            file.write((("" if whole else "\n") + line + "\n").encode())
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise UserError(
+            f"{path}: cannot be written ({error.strerror or error}); free some space or mend its permissions"
+        ) from None
+
+
 def write_tensors(path: Path, tensors: dict[str, np.ndarray]) -> None:
     """Writes arrays as safetensors, whole."""
     from safetensors.numpy import save

@@ -3,6 +3,7 @@
 import hashlib
 import os
 import platform
+import subprocess
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,18 @@ def installed(package: str) -> str | None:
         return version(package)
     except PackageNotFoundError:
         return None
+
+
+def commit() -> str | None:
+    """Short hash of the checkout that this code runs from, "+" where files differ from it; None where it is no checkout."""
+    root = Path(__file__).parent.parent
+    if not (root / ".git").exists():
+        return None
+    try:
+        found = subprocess.run(["git", "-C", str(root), "describe", "--always", "--dirty=+"], capture_output=True, text=True)
+    except OSError:  # no git
+        return None
+    return found.stdout.strip() or None
 
 
 def peak_memory_gib() -> float | None:

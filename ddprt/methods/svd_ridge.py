@@ -23,6 +23,8 @@ from ddprt.fitting.selection import Spectrum, choose_ridge, decompose
 from ddprt.fitting.transfer import point_stretch, solve_transfer
 from ddprt.methods.method import Examples, FitReport, Frame, Method, array_bytes, as_pytree, columns, found_in, measured
 
+_ADDED_UP = 16  # bases up to which a sum is faster than a product of matrices
+
 
 @as_pytree
 @dataclass(frozen=True)
@@ -44,10 +46,8 @@ class LinearTransfer:
 
     def predict(self, frame: Frame) -> Float[Array, "frames texels 3"]:
         """See `Relighter`."""
-        light = jnp.matmul(self.coefficients(frame), self.basis, precision="highest") + self.mean
-        if len(self.matrix) == 3:
-            return jnp.moveaxis(light, 1, 2)
-        return light.reshape(len(light), -1, 3)
+        light = compose(self.coefficients(frame), self.basis, self.mean)
+        return light if len(self.matrix) == 3 else light.reshape(len(light), -1, 3)
 
     def truncated(self, bases: int) -> "LinearTransfer":
         """The same with all but the first `bases` vectors set to zero; shapes stay, so nothing compiles again."""
@@ -64,6 +64,23 @@ class LinearTransfer:
         """See `Relighter`: two per multiply-add of transfer and composition."""
         groups, bases, inputs = self.matrix.shape
         return 2 * groups * bases * (inputs + self.basis.shape[1])
+
+
+def compose(
+    coefficients: Float[Array, "frames groups bases"], basis: Float[Array, "bases entries"], mean: Float[Array, " entries"]
+) -> Float[Array, "frames entries groups"]:
+    """y = mean + U u, each entry's groups side by side.
+
+    Few bases are added up in one loop that reads each once and writes y in place, at the pace of the memory; a product of
+    matrices writes y by rows first and turns it around in a second pass, which only pays where there is much to multiply.
+    """
+    if len(basis) > _ADDED_UP:
+        return jnp.moveaxis(jnp.matmul(coefficients, basis, precision="highest") + mean, 1, 2)
+
+    def frame(u: Array) -> Array:
+        return sum((vector[:, None] * u[:, k] for k, vector in enumerate(basis)), mean[:, None])
+
+    return jnp.broadcast_to(jax.vmap(frame)(coefficients), (len(coefficients), basis.shape[1], coefficients.shape[1]))
 
 
 class SvdRidge(Method):

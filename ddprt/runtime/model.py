@@ -16,10 +16,12 @@ from ddprt.errors import UserError
 from ddprt.fitting.encoding import Encoding
 from ddprt.lights import Light, Lighting, parse_lighting
 from ddprt.methods.method import Frame, Relighter
+from ddprt.runtime.coefficients import Coefficients
 from ddprt.runtime.trust import Trust, Yardstick
 from ddprt.sampling.points import Samples
 
 _LARGEST = float(np.finfo(np.float32).max)
+_NOT_FINITE = "values: got NaN or infinity in float32, expected finite W/m²; check how the points are shaded"
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +83,39 @@ class Model:
             light = np.where(kept < 1, np.clip(faded, -_LARGEST, _LARGEST), light).astype(np.float32)
         return light[0] if single else light
 
+    def coefficients(self, values: Any) -> np.ndarray:
+        """What each basis texture counts in a frame: y = max(0, sum of coefficients times `textures`)^gamma, in W/m².
+
+        The brightness of the frame is in them; a mean lightmap, where there is one, is the first texture. Quick: a few
+        microseconds for one frame.
+
+        Args:
+          values: as for `predict`.
+        Returns:
+          (channels, textures) or (frames, channels, textures) float32; for "multi" all channels share one row.
+        Raises:
+          UserError: as for `predict`, or the method is not linear.
+        """
+        known = type(values) is np.ndarray and values.dtype == np.float32
+        measured = values if known else _real(values)
+        single = measured.ndim == 2
+        self._check_shape(measured)
+        answer = self._transfer.answer(measured[None] if single else measured)
+        if answer is None:
+            raise UserError(_NOT_FINITE)
+        return answer[0] if single else answer
+
+    @cached_property
+    def textures(self) -> np.ndarray:
+        """(textures, texels) float32 for "mono", (textures, texels, 3) for "multi": what `coefficients` weigh.
+
+        Raises:
+          UserError: the method is not linear.
+        """
+        leads, relighter = self._transfer.leads, self.relighter
+        entries = np.concatenate([relighter.mean[None], relighter.basis]) if leads else np.asarray(relighter.basis)  # type: ignore[attr-defined]
+        return entries if self.encoding.channels == "mono" else entries.reshape(len(entries), -1, 3)
+
     def trust(self, values: Any) -> Trust | None:
         """How far measured light lies from what the model was trained on, and what error to expect; None in older models.
 
@@ -130,11 +165,18 @@ class Model:
         """Measured light as frames, and whether it was a single one."""
         measured = _real(values)
         single = measured.ndim == 2
+        self._check_shape(measured)
+        if not np.isfinite(measured).all():
+            raise UserError(_NOT_FINITE)
+        return jnp.asarray(measured[None] if single else measured), single
+
+    def _check_shape(self, measured: np.ndarray) -> None:
         if measured.shape[-2:] != (self.points, 3) or measured.ndim not in (2, 3):
             raise UserError(f"values: got shape {measured.shape}, expected ({self.points}, 3) or (frames, {self.points}, 3)")
-        if not np.isfinite(measured).all():
-            raise UserError("values: got NaN or infinity in float32, expected finite W/m²; check how the points are shaded")
-        return jnp.asarray(measured[None] if single else measured), single
+
+    @cached_property
+    def _transfer(self) -> Coefficients:
+        return Coefficients.of(self.relighter, self.encoding)
 
     @cached_property
     def _places(self) -> tuple[Array, Array]:

@@ -1,0 +1,150 @@
+"""What a frame asks of the basis textures: u = M x in microseconds, on the CPU and past the overhead of a JAX call.
+
+A shader composes y = max(0, sum over textures of u_b B_b)^gamma. Here the scale of the measured light is folded into u, and a
+mean counts as the first texture, so that these numbers and the textures are all that it needs. A frame is answered by one
+compiled loop; many frames by a product of matrices.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ddprt.axes import Float32
+from ddprt.compiled import compiled
+from ddprt.errors import UserError
+from ddprt.fitting.encoding import Encoding
+from ddprt.methods.svd_ridge import LinearTransfer
+
+_MANY = 16  # frames from which BLAS is faster than the loop
+_LARGEST = float(np.finfo(np.float32).max)
+_DIVISIBLE = 2.0**126  # as in `ddprt.fitting.encoding`
+
+
+@dataclass(frozen=True, eq=False)
+class Coefficients:
+    """The transfer of a linear model, laid out for the CPU.
+
+    Attributes:
+      matrix: M transposed, so that the loop over bases runs along memory.
+      offset, intercept: as in `LinearTransfer`.
+      power: 1 / gamma; 1 in linear space.
+      leads: 1 where a mean is the first texture, else 0.
+    """
+
+    matrix: Float32[np.ndarray, "groups inputs bases"]
+    offset: Float32[np.ndarray, "groups inputs"]
+    intercept: Float32[np.ndarray, "groups bases"]
+    power: float
+    leads: int
+
+    @classmethod
+    def of(cls, relighter: object, encoding: Encoding) -> "Coefficients":
+        """Those of a model.
+
+        Raises:
+          UserError: its method is not linear.
+        """
+        if not isinstance(relighter, LinearTransfer):
+            raise UserError("coefficients: got a method without a linear basis, expected svd-ridge; use predict instead")
+        return cls(
+            np.ascontiguousarray(np.asarray(relighter.matrix).swapaxes(1, 2)),
+            np.asarray(relighter.offset),
+            np.asarray(relighter.intercept),
+            1.0 if encoding.space == "linear" else 1 / encoding.gamma,
+            int(np.asarray(relighter.mean).any()),
+        )
+
+    def answer(self, values: Float32[np.ndarray, "frames points 3"]) -> Float32[np.ndarray, "frames groups textures"] | None:
+        """Weights of the textures for each frame; None where light is not finite."""
+        frames = len(values)
+        groups, inputs, bases = self.matrix.shape
+        seen = values if groups == 3 else values.reshape(frames, inputs, 1)
+        out = np.zeros((frames, groups, bases + self.leads), np.float32)
+        if frames < _MANY:
+            fine = _answer(seen, self.matrix, self.offset, self.intercept, np.float32(self.power), self.leads, out)
+            return out if fine else None
+        encoded, size = np.empty((groups, frames, inputs), np.float32), np.empty((groups, frames, 1), np.float32)
+        if not _encode(seen, self.offset, np.float32(self.power), encoded, size):
+            return None
+        with np.errstate(over="ignore"):
+            answered = size * (encoded @ self.matrix + self.intercept[:, None])
+        out[:, :, self.leads :] = np.clip(answered, -_LARGEST, _LARGEST).swapaxes(0, 1)
+        if self.leads:
+            out[:, :, 0] = size[..., 0].T
+        return out
+
+
+@compiled
+def _answer(
+    values: np.ndarray,
+    matrix: np.ndarray,
+    offset: np.ndarray,
+    intercept: np.ndarray,
+    power: np.floating,
+    leads: int,
+    out: np.ndarray,
+) -> bool:
+    """Fills `out`; False where the measured light is not finite. Frames without light stay 0."""
+    groups, inputs, bases = matrix.shape
+    z = np.empty(inputs, np.float32)
+    for frame in range(len(values)):
+        for group in range(groups):
+            size = _encode_one(values[frame, :, group], offset[group], power, z)
+            if size < 0:
+                return False
+            if size == 0:
+                continue
+            u = out[frame, group, leads:]
+            u[:] = intercept[group]
+            M = matrix[group]
+            whole = inputs // 4 * 4
+            for p in range(0, whole, 4):  # four at a time: u is read and written a quarter as often
+                a, b, c, d = z[p], z[p + 1], z[p + 2], z[p + 3]
+                for k in range(bases):
+                    u[k] += (a * M[p, k] + b * M[p + 1, k]) + (c * M[p + 2, k] + d * M[p + 3, k])
+            for p in range(whole, inputs):
+                for k in range(bases):
+                    u[k] += z[p] * M[p, k]
+            for k in range(bases):
+                u[k] = min(max(u[k] * size, np.float32(-_LARGEST)), np.float32(_LARGEST))
+            if leads:
+                out[frame, group, 0] = size
+    return True
+
+
+@compiled
+def _encode(values: np.ndarray, offset: np.ndarray, power: np.floating, z: np.ndarray, size: np.ndarray) -> bool:
+    """The same up to the product: encoded light less its offset, and the factor of each row; False where it is not finite."""
+    for group in range(values.shape[2]):
+        for frame in range(len(values)):
+            found = _encode_one(values[frame, :, group], offset[group], power, z[group, frame])
+            if found < 0:
+                return False
+            size[group, frame, 0] = found
+    return True
+
+
+@compiled
+def _encode_one(values: np.ndarray, offset: np.ndarray, power: np.floating, z: np.ndarray) -> np.floating:
+    """Scaled, bent and centred values in `z`; returns what the answer is to be multiplied by, before the gamma of the shader.
+
+    0 for a dark frame, -1 where a value is not finite.
+    """
+    total = 0.0
+    for p in range(len(values)):
+        total += np.float64(values[p]) * np.float64(values[p])  # no float32's square leaves the range of float64
+    if not np.isfinite(total):
+        return np.float32(-1)
+    scale = np.float32(min(np.sqrt(total), _DIVISIBLE))
+    if scale == 0:
+        z[:] = 0
+        return np.float32(0)
+    for p in range(len(values)):
+        z[p] = values[p] / scale
+    if power != 1:
+        for p in range(len(values)):
+            bent = abs(z[p]) ** power
+            z[p] = bent if z[p] >= 0 else -bent
+    for p in range(len(values)):
+        z[p] -= offset[p]
+    return scale**power
