@@ -312,8 +312,9 @@ def _streamed(data: Dataset, method: Method, name: str, asked: bool | None) -> P
     """
     lightings = len(data.split("train")) + len(data.split("validation"))
     size, free = 12 * len(data.area) * lightings, _free_memory()
-    pack = data.packed() if asked or size // 2 > _WORTH_PACKING else None
-    if asked or (asked is None and method.streams and free is not None and size > _SHARE * free):
+    wanted = asked or (asked is None and method.streams and free is not None and size > _SHARE * free)
+    pack = data.packed() if wanted or size // 2 > _WORTH_PACKING else None
+    if wanted:
         if method.streams and pack is not None:
             return pack
         if asked:
