@@ -9,7 +9,7 @@ import shlex
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
@@ -366,8 +366,24 @@ def _dispatch(words: list[str]) -> int:
     if "-h" in rest or "--help" in rest:
         _help(name)
         return 0
-    VERBS[name].work(parse(name, rest))
+    call = parse(name, rest)
+    _keep_compiled()
+    VERBS[name].work(call)
     return 0
+
+
+def _keep_compiled() -> None:
+    """Lets JAX keep what it compiles for the next command, unless it is told elsewhere where to."""
+    if "jax" in sys.modules:  # it reads these when it is imported; within another program they are not ours to set
+        return
+    from ddprt.files import cache_folder
+    from ddprt.machine import instruction_set
+
+    folder = cache_folder() / f"jax-{instruction_set()}"
+    with suppress(OSError):  # a cache that cannot be written only costs time
+        folder.mkdir(parents=True, exist_ok=True)
+        os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder))
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
 
 def parse(name: str, words: list[str]) -> Call:

@@ -109,6 +109,12 @@ def written_whole(path: Path) -> Iterator[Path]:
             temporary.unlink()
 
 
+def cache_folder() -> Path:
+    """Where what only saves time is kept: `DDPRT_CACHE`, else ddprt in the user's cache; it may be deleted at any time."""
+    base = os.environ.get("DDPRT_CACHE") or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ddprt"
+    return Path(base)
+
+
 def make_folder(path: Path) -> None:
     """Creates a folder and its parents.
 

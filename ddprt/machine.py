@@ -1,5 +1,6 @@
 """What a run ran on: recorded beside every measured second."""
 
+import hashlib
 import os
 import platform
 import subprocess
@@ -22,6 +23,16 @@ def machine() -> dict[str, Any]:
         "python": platform.python_version(),
         "packages": {name: installed(name) for name in PACKAGES},
     }
+
+
+def instruction_set() -> str:
+    """What code compiled here may ask of a processor, as eight digits: elsewhere it might not run."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        kinds = sorted({line for line in lines if line.startswith(("flags", "Features", "model name"))})
+    except OSError:
+        kinds = [platform.processor()]
+    return hashlib.sha256("\n".join([platform.machine(), *kinds]).encode()).hexdigest()[:8]
 
 
 def installed(package: str) -> str | None:
