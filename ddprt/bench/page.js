@@ -8,6 +8,7 @@
   const indexOf = new Map(data.settings.map((setting, index) => [setting.digest, index]));
   const plots = [...document.querySelectorAll(".plot")].map((figure) => ({
     figure,
+    title: figure.querySelector(".error-title"),
     canvas: figure.querySelector(".canvas"),
     choice: figure.querySelector("select"),
     words: figure.querySelector(".words"),
@@ -92,6 +93,7 @@
     const across = data.costs.findIndex((axis) => axis.key === plot.choice.value);
     const up = data.errors.findIndex((axis) => axis.key === errorChoice.value);
     const [x, y] = [data.costs[across], data.errors[up]];
+    plot.title.textContent = y.title;
     const pair = data.pairs[`${y.key}/${x.key}`];
     const width = plot.canvas.clientWidth;
     const height = Math.round(Math.min(400, Math.max(270, 0.68 * width)));
@@ -117,13 +119,9 @@
     make("path", { class: "frame", d: `M${frame.left},${frame.top}V${frame.bottom}H${frame.right}` }, svg);
     make("text", { class: "title", x: (frame.left + frame.right) / 2, y: height - 6, "text-anchor": "middle" }, svg, x.title);
 
+    const floors = y.key === "error" ? data.floors : [];
+    for (const [, level] of floors) make("line", { class: "floor", x1: frame.left, x2: frame.right, y1: atY(level), y2: atY(level) }, svg);
     const taken = [];
-    if (y.key === "error")
-      for (const [text, level] of data.floors) {
-        make("line", { class: "floor", x1: frame.left, x2: frame.right, y1: atY(level), y2: atY(level) }, svg);
-        taken.push(boxOf(make("text", { class: "floor", x: frame.right - 2, y: atY(level) - 4, "text-anchor": "end" }, svg, text), 2));
-      }
-
     const places = data.settings.map((setting) => {
       const [cost, error] = [setting.costs[across], setting.errors[up]];
       return cost && error && cost[0] > 0 && error[0] > 0 ? [atX(cost[0]), atY(error[0])] : null;
@@ -133,19 +131,27 @@
 
     if (pair.path.length) {
       let d = `M${round(places[pair.path[0]][0])},${frame.top}`;
-      for (const index of pair.path) d += `H${round(places[index][0])}V${round(places[index][1])}`;
+      let [fromX, fromY] = [places[pair.path[0]][0], frame.top];
+      for (const index of pair.path) {
+        const [toX, toY] = places[index];
+        d += `H${round(toX)}V${round(toY)}`;
+        taken.push({ x0: fromX, x1: toX, y0: fromY - 1, y1: fromY + 1 }, { x0: toX - 1, x1: toX + 1, y0: fromY, y1: toY });
+        [fromX, fromY] = [toX, toY];
+      }
+      taken.push({ x0: fromX, x1: frame.right, y0: fromY - 1, y1: fromY + 1 });
       make("path", { class: "front", d: `${d}H${frame.right}` }, svg);
     }
     const onFront = new Set(pair.front);
     const order = places.map((_, index) => index).filter((index) => places[index]);
-    order.sort((a, b) => onFront.has(a) - onFront.has(b));
+    const rank = (index) => (onFront.has(index) ? 2 : index === data.base ? 1 : 0);
+    order.sort((a, b) => rank(a) - rank(b));
     for (const index of order) {
       const setting = data.settings[index];
       const marker = data.markers[setting.kind];
       const [px, py] = places[index];
-      const best = onFront.has(index);
+      const best = rank(index) > 0;
       const gone = faded(setting);
-      const link = make("a", { href: `#${setting.digest}`, "data-index": index, class: `${best ? "best" : "beaten"}${gone ? " faded" : ""}` }, svg);
+      const link = make("a", { href: `#${setting.digest}`, "data-index": index, class: `${["beaten", "base", "best"][rank(index)]}${gone ? " faded" : ""}` }, svg);
       if (!best || gone) link.setAttribute("tabindex", "-1");
       link.style.setProperty("--own", marker.colour === "#24292f" ? "var(--plot-ink)" : marker.colour);
       link.setAttribute("aria-label", `${setting.name}: ${setting.errors[up][1]}, ${setting.costs[across][1]}`);
@@ -169,29 +175,51 @@
       taken.push(about(px, py, 11));
     }
 
+    for (const [text, level] of floors) {
+      const node = make("text", { class: "floor" }, svg, text);
+      const ways = [[frame.right - 2, "end"], [frame.left + 4, "start"], [(frame.left + frame.right) / 2, "middle"]];
+      let [fewest, least] = [null, Infinity];
+      for (const [at, anchor] of ways)
+        for (const sink of [-4, 12]) {
+          for (const [key, value] of [["x", at], ["y", atY(level) + sink], ["text-anchor", anchor]]) node.setAttribute(key, value);
+          const box = boxOf(node, 1);
+          const hidden = taken.filter((other) => overlap(box, other)).length;
+          if (hidden < least) [fewest, least] = [{ at, anchor, sink, box }, hidden];
+        }
+      for (const [key, value] of [["x", fewest.at], ["y", atY(level) + fewest.sink], ["text-anchor", fewest.anchor]]) node.setAttribute(key, value);
+      taken.push(fewest.box);
+    }
+
     const shown = pair.path.filter((index) => !faded(data.settings[index]));
-    const first = [pair.knee, shown[0], shown[shown.length - 1], ...spaced(shown)];
+    const first = [pair.knee, shown[0], shown[shown.length - 1], ...spaced(shown)].filter((entry) => shown.includes(entry));
+    if (data.base !== null && places[data.base]) first.splice(1, 0, data.base);
     let named = 0;
-    for (const index of new Set(first.filter((entry) => shown.includes(entry)))) {
+    for (const index of new Set(first)) {
       if (named >= (width < 420 ? 5 : 9)) break;
       const [px, py] = places[index];
       const knee = index === pair.knee;
-      const node = make("text", { class: knee ? "label knee-label" : "label" }, svg, `${knee ? "knee: " : ""}${data.settings[index].name}`);
+      const node = make("text", { class: knee ? "label knee-label" : "label" }, svg);
       const far = knee ? 14 : 9;
       const near = 0.75 * far;
       const ways = [[near, -near, "start", 0], [-near, near, "end", 9], [far, 0, "start", 4], [-far, 0, "end", 4], [0, -far, "middle", 0], [0, far, "middle", 9], [-near, -near, "end", 0], [near, near, "start", 9]];
-      const fits = [1, 2.2, 3.6].some((reach) =>
-        ways.some(([dx, dy, anchor, sink]) => {
-          node.setAttribute("x", px + reach * dx);
-          node.setAttribute("y", py + reach * dy + sink);
-          node.setAttribute("text-anchor", anchor);
-          const box = boxOf(node, 1.5);
-          const inside = box.x0 >= frame.left && box.x1 <= width && box.y0 >= 0 && box.y1 <= frame.bottom;
-          if (!inside || taken.some((other) => overlap(box, other))) return false;
-          taken.push(box);
-          return true;
-        })
-      );
+      const fitsAs = (text) => {
+        node.textContent = text;
+        return [1, 2.2, 3.6].some((reach) =>
+          ways.some(([dx, dy, anchor, sink]) => {
+            node.setAttribute("x", px + reach * dx);
+            node.setAttribute("y", py + reach * dy + sink);
+            node.setAttribute("text-anchor", anchor);
+            const box = boxOf(node, 1.5);
+            const inside = box.x0 >= frame.left && box.x1 <= width && box.y0 >= 0 && box.y1 <= frame.bottom;
+            if (!inside || taken.some((other) => overlap(box, other))) return false;
+            taken.push(box);
+            if (reach > 1) make("line", { class: "leader", x1: px + dx, y1: py + dy, x2: px + reach * dx, y2: py + reach * dy }, svg);
+            return true;
+          })
+        );
+      };
+      const name = data.settings[index].name;
+      const fits = (knee ? [`knee: ${name}`, "knee"] : [name]).some(fitsAs);
       if (fits) named += 1;
       else node.remove();
     }

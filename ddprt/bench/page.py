@@ -26,7 +26,9 @@ _ROOM, _TINY = 0.08, 1.5  # free part at each end of an axis, and the least rati
 _FEWEST, _MOST = 4, 7  # ticks
 _FLAT = 1e4  # a tenth of the error for so many times the cost is as good as never
 _MANTISSAS = ((1,), (1, 3), (1, 2, 5), (1, 1.5, 2, 3, 5, 7), tuple(i / 10 for i in range(10, 100)))
-_STEPS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20)  # decibels
+_BINARY = ((1,), (1, 1.5), (1, 1.25, 1.5, 1.75), tuple(1 + i / 16 for i in range(16)))
+_UNITS = {2.0**30: "GiB", 2.0**20: "MiB", 2.0**10: "KiB", 1.0: "B"}
+_STEPS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500)  # decibels
 _ROWS = ("error", "worst", "flicker", "flip", "pu21")
 
 
@@ -114,7 +116,7 @@ class Sweep:
 
     def floors(self) -> list[tuple[str, float]]:
         """What no setting can be seen to pass: noise of the held-out maps, and what the base's basis leaves."""
-        named = {"noise": "noise of the held-out maps", "projection": f"projection, {BASE}"}
+        named = {"noise": "noise floor", "projection": "projection floor"}
         found = [(text, pareto.number(self.base or {}, f"floors.{key}_relative_rmse")) for key, text in named.items()]
         return [(f"{text} ({_percent(level)})", level) for text, level in found if level]
 
@@ -147,6 +149,7 @@ class Sweep:
             markers=[(name, *look) for name, look in markers.items()],
             front=pareto.path(costs, errors),
             knee=pareto.knee(costs, errors),
+            base=next((index for index, record in enumerate(self.settings) if record is self.base), None),
         )  # fmt: skip
         y = self.axis(ERRORS[error], [level for _, level in floors])
         return front_figure(cloud, self.axis(COSTS[cost]), y, floors=floors, note="no setting has both")
@@ -170,13 +173,6 @@ class Sweep:
         if not inner:
             few = "fewer than three settings make it up" if len(along) < 3 else "it hardly bends"
             said.append(f"The front has no knee: {few}.")
-        noise = pareto.number(self.base or {}, "floors.noise_relative_rmse")
-        best = errors[along[-1]]
-        if error == "error" and noise and best and best < 10 * noise:
-            said.append(
-                f"A tenth of the least error would lie below the noise of the held-out maps ({_percent(noise)}), where no "
-                "error can be told."
-            )
         return said
 
     def data(self) -> dict[str, Any]:
@@ -212,7 +208,15 @@ class Sweep:
             for name, table in (("errors", ERRORS), ("costs", COSTS))
         }
         looks = [{"name": name, "colour": colour, "outline": outline} for name, (colour, outline) in markers.items()]
-        return {**axes, "drawn": list(DRAWN), "settings": settings, "pairs": pairs, "floors": floors, "markers": looks}
+        return {
+            **axes,
+            "drawn": list(DRAWN),
+            "settings": settings,
+            "pairs": pairs,
+            "floors": floors,
+            "markers": looks,
+            "base": self.settings.index(self.base) if self.base else None,
+        }
 
     def rows(self) -> list[dict[str, Any]]:
         """Rows of the table, the most exact setting first."""
@@ -272,20 +276,21 @@ def _page(found: Sweep, title: str) -> str:
         pictures={cost: base64.b64encode(figure.encode()).decode() for cost, figure in found.figures.items()},
         words={cost: found.words("error", cost) for cost in DRAWN},
         spoken=spoken,
+        noise=_say(noise, "percent") if (noise := pareto.number(found.base or {}, "floors.noise_relative_rmse")) else "",
         data=embedded(found.data()),
     )
 
 
 def ticks(low: float, high: float, form: Form) -> list[tuple[float, str]]:
-    """Between four and seven round values between the ends of a logarithmic axis, and how they are written."""
+    """Round values between the ends of a logarithmic axis, seven at most and rising, and how they are written."""
     if form == "decibel":
         ends = [-20 * math.log10(end) for end in (high, low)]
         for step in _STEPS:
             steps = range(math.ceil(ends[0] / step), math.floor(ends[1] / step) + 1)
             if len(steps) <= _MOST:
                 break
-        return [(10 ** (-i * step / 20), f"{i * step:g} dB") for i in steps]
-    base, mantissas = (2, ((1,), (1, 1.5), (1, 1.25, 1.5, 1.75))) if form == "bytes" else (10, _MANTISSAS)
+        return [(10 ** (-i * step / 20), f"{i * step:g} dB") for i in reversed(steps)]
+    base, mantissas = (2, _BINARY) if form in ("bytes", "gib") else (10, _MANTISSAS)
     first, last = math.floor(math.log(low, base)), math.ceil(math.log(high, base))
     values: list[float] = []
     for mantissa in mantissas:
@@ -294,7 +299,18 @@ def ticks(low: float, high: float, form: Form) -> list[tuple[float, str]]:
         if len(values) >= _FEWEST:
             break
     values = values[:: -(-len(values) // _MOST)] if values else []
-    return [(value, _say(value, form)) for value in values]
+    return [(value, _short(value, form)) for value in values]
+
+
+def _short(value: float, form: Form) -> str:
+    """A round value as it stands at an axis."""
+    if form == "percent":
+        return f"{100 * value:g}\u00a0%"
+    if form in ("bytes", "gib"):
+        value = value * 2**30 if form == "gib" else value
+        scale = next((scale for scale in _UNITS if value >= scale), 1.0)
+        return f"{value / scale:g} {_UNITS[scale]}"
+    return _say(value, form)
 
 
 def spoken(measure: Measure, record: Record) -> str:
@@ -336,4 +352,9 @@ def _rate(leg: Leg, measure: Measure) -> str:
     less = "20 dB more" if measure.form == "decibel" else "ten times less error"
     if leg.factor >= _FLAT:
         return f"at this rate {less} would cost more than {_FLAT:,.0f} times as much; the error hardly falls any more"
-    return f"at this rate {less} costs {leg.factor:.3g} times as much"
+    return f"at this rate {less} costs {_twice(leg.factor)} times as much"
+
+
+def _twice(factor: float) -> str:
+    """Two digits below ten thousand, without powers."""
+    return f"{float(f'{factor:.2g}'):,.10g}"
