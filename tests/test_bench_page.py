@@ -399,7 +399,7 @@ def test_ticks_are_few_rise_and_are_told_apart(form: str, start: float, decades:
     low, high = scale * 10**start, scale * 10 ** (start + decades)
     found = ticks(low, high, form)
     values, texts = [value for value, _ in found], [text for _, text in found]
-    assert 2 <= len(found) <= 7
+    assert 2 <= len(found) <= 6
     assert values == sorted(set(values))
     assert len(set(texts)) == len(texts)
     # a decibel's place on the axis is computed back from its logarithm, which may round past the end

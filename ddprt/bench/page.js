@@ -121,7 +121,7 @@
 
     const floors = y.key === "error" ? data.floors : [];
     for (const [, level] of floors) make("line", { class: "floor", x1: frame.left, x2: frame.right, y1: atY(level), y2: atY(level) }, svg);
-    const taken = [];
+    const [taken, words] = [[], []];
     const places = data.settings.map((setting) => {
       const [cost, error] = [setting.costs[across], setting.errors[up]];
       return cost && error && cost[0] > 0 && error[0] > 0 ? [atX(cost[0]), atY(error[0])] : null;
@@ -187,7 +187,8 @@
           if (hidden < least) [fewest, least] = [{ at, anchor, sink, box }, hidden];
         }
       for (const [key, value] of [["x", fewest.at], ["y", atY(level) + fewest.sink], ["text-anchor", fewest.anchor]]) node.setAttribute(key, value);
-      taken.push(fewest.box);
+      words.push(fewest.box);
+      taken.push(fewest.box, { x0: frame.left, x1: frame.right, y0: atY(level) - 1, y1: atY(level) + 1 });
     }
 
     const shown = pair.path.filter((index) => !faded(data.settings[index]));
@@ -212,7 +213,10 @@
             const box = boxOf(node, 1.5);
             const inside = box.x0 >= frame.left && box.x1 <= width && box.y0 >= 0 && box.y1 <= frame.bottom;
             if (!inside || taken.some((other) => overlap(box, other))) return false;
-            taken.push(box);
+            const line = reach > 1 ? [...Array(10).keys()].map((bit) => about(px + dx * (1 + ((reach - 1) * bit) / 9), py + dy * (1 + ((reach - 1) * bit) / 9), 0.5)) : [];
+            if (line.some((bit) => words.some((other) => overlap(bit, other)))) return false;
+            taken.push(box, ...line);
+            words.push(box);
             if (reach > 1) make("line", { class: "leader", x1: px + dx, y1: py + dy, x2: px + reach * dx, y2: py + reach * dy }, svg);
             return true;
           })

@@ -17,13 +17,13 @@ from ddprt import __version__
 from ddprt.bench import pareto
 from ddprt.bench.pareto import COSTS, DRAWN, ERRORS, Form, Leg, Measure, Record
 from ddprt.files import make_folder, write_text
-from ddprt.report.fronts import STAR, Axis, Cloud, front_figure, marker
+from ddprt.report.fronts import SHAPES, STAR, Axis, Cloud, front_figure, marker
 from ddprt.report.page import _bytes, _count, _percent, _seconds
 
 PAGE, TABLE = "frontier.html", "frontier.csv"
 BASE, SEVERAL = "as configured", "several knobs at once"
 _ROOM, _TINY = 0.08, 1.5  # free part at each end of an axis, and the least ratio of its ends
-_FEWEST, _MOST = 4, 7  # ticks
+_FEWEST, _MOST = 4, 6  # ticks
 _FLAT = 1e4  # a tenth of the error for so many times the cost is as good as never
 _MANTISSAS = ((1,), (1, 3), (1, 2, 5), (1, 1.5, 2, 3, 5, 7), tuple(i / 10 for i in range(10, 100)))
 _BINARY = ((1,), (1, 1.5), (1, 1.25, 1.5, 1.75), tuple(1 + i / 16 for i in range(16)))
@@ -107,7 +107,7 @@ class Sweep:
         """Colour and outline of every kind that occurs, the base first."""
         kinds = {self.kind(record) for record in self.settings}
         own = {BASE: ("#24292f", STAR), **{knob: marker(order) for order, knob in enumerate(self.knobs)}}
-        own[SEVERAL] = marker(len(self.knobs))
+        own[SEVERAL] = marker(max(len(SHAPES) - 1, len(self.knobs)))
         return {name: look for name, look in own.items() if name in kinds}
 
     def pair(self, error: str, cost: str) -> tuple[list[float | None], list[float | None]]:
@@ -282,7 +282,7 @@ def _page(found: Sweep, title: str) -> str:
 
 
 def ticks(low: float, high: float, form: Form) -> list[tuple[float, str]]:
-    """Round values between the ends of a logarithmic axis, seven at most and rising, and how they are written."""
+    """Round values between the ends of a logarithmic axis, six at most and rising, and how they are written."""
     if form == "decibel":
         ends = [-20 * math.log10(end) for end in (high, low)]
         for step in _STEPS:

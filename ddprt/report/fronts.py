@@ -14,6 +14,7 @@ _WIDTH, _PLOT, _ROW = 3.4, 2.3, 0.118  # inches: of a column, height of the axes
 _BELOW = 0.36  # inches for what is written below the axes
 _COLUMNS = 2  # of the legend
 _SMALL = 5.8  # points, of what stands inside the axes
+_LETTERS = 7.0  # pixels: what is higher is text, a point or an upright line
 _CLEAR = 1.0  # points between labels and what else is drawn
 _BESIDE = tuple(
     (at, across, side, up, rise)
@@ -57,9 +58,9 @@ SHAPES = (
     _star(4, 0.42),
     [(-1.0, 0.45), (1.0, 0.45), (1.0, -0.45), (-1.0, -0.45)],
     _spokes(3, 0.0),
-    _polygon(6, 0.92),
-    [(-0.45, 1.0), (0.45, 1.0), (0.45, -1.0), (-0.45, -1.0)],
     _star(6, 0.5),
+    [(-0.45, 1.0), (0.45, 1.0), (0.45, -1.0), (-0.45, -1.0)],
+    _polygon(6, 0.92),
     _spokes(3, 1.0),
 )
 """Outlines of markers within a circle of radius 1.1, y upwards."""
@@ -262,11 +263,24 @@ def _placed(axes: Any, cloud: Cloud, index: int, text: str, frame: Any, taken: l
         )  # fmt: skip
         box = _text_box(said).padded(_CLEAR * axes.get_figure().dpi / 72)
         inside = frame.x0 <= box.x0 and box.x1 <= frame.x1 and frame.y0 <= box.y0 and box.y1 <= frame.y1
-        if inside and not any(box.overlaps(other) for other in taken):
-            taken.append(box)
+        line = _leader(axes, cloud, index, across, up) if reach > 1 else []
+        words = [other for other in taken if other.height > _LETTERS]
+        free = not any(box.overlaps(other) for other in taken)
+        if inside and free and not any(other.overlaps(bit) for bit in line for other in words):
+            taken += [*line, box]
             return True
         said.remove()
     return False
+
+
+def _leader(axes: Any, cloud: Cloud, index: int, across: float, up: float) -> list[Any]:
+    """What the line from a point to its label covers, bit by bit; its first part lies among the points."""
+    from matplotlib.transforms import Bbox
+
+    start = axes.transData.transform((cloud.costs[index], cloud.errors[index]))
+    way = np.array([across, up]) * axes.get_figure().dpi / 72
+    bits = [start + share * way for share in np.linspace(0.4, 1, 9)]
+    return [Bbox([(x - 0.5, y - 0.5), (x + 0.5, y + 0.5)]) for x, y in bits]
 
 
 def _text_box(said: Any) -> Any:
