@@ -26,6 +26,7 @@ WALK = [
     "pipeline_active",
     "pipeline",
     "pipeline_inspect",
+    "verbs",
     "cli",
 ]
 FILES = sorted(PACKAGE.rglob("*.py"))
