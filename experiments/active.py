@@ -2,16 +2,18 @@
 
 Question: how many lightings chosen by what their measurements tell reach the held-out error of 128 random ones, and what do
           measurement points by pivoted QR gain over blue noise with the same number of shaded samples?
-Command:  python experiments/active.py [--quick] [--seeds 6] [--most 256]
+Command:  python experiments/active.py [--quick] [--seeds 3] [--most 128] [--only SCENE] [--others]
 Answer:   docs/active.md
 
 A pool of lightings is baked once per scene, into runs/active-NAME. A seed shuffles it: random design takes the first N, the
 others choose N of the first 8 N (or of all there are). Held-out lightings are random and the same for all. Scores of a scene
-are kept beside its pool: a run that was stopped goes on with the next scene.
+are kept beside its pool: a run that was stopped goes on with the next scene. `--others` compares what was tried besides, at one
+number of lightings and two of points, and draws nothing.
 """
 
 import argparse
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,11 +24,12 @@ import ddprt
 from ddprt.config import load_config
 from ddprt.dataset.store import Dataset, average_into_points
 from ddprt.fitting.selection import choose_ridge, decompose
-from ddprt.sampling.design import choose_columns, choose_rows, directions
+from ddprt.sampling.design import RIDGE, choose_columns, choose_rows, directions
 
 BASES = 16
 COUNTS = (8, 16, 32, 64, 128, 256)
 POINTS = (16, 32, 64, 128, 256)
+OTHERS = 32, (32, 128)  # lightings and points that all that was tried is compared at
 TRAIN_OF_POINTS = 96
 EACH = 8  # candidates per lighting
 SIZE = {"atlas.resolution": "48", "transport.samples": "96", "transport.test_samples": "192"}
@@ -134,8 +137,49 @@ def facility(rows: np.ndarray, count: int) -> np.ndarray:
     return np.array(chosen)
 
 
+def weighed(rows: np.ndarray, count: int, weight: np.ndarray, ridge: float = RIDGE) -> np.ndarray:
+    """V-optimal for a mean in which candidates count unevenly, with the kernel of all of them."""
+    kernel, chosen = rows @ rows.T, list[int]()
+    for _ in range(count):
+        gain = weight @ kernel**2 / (np.maximum(np.diag(kernel), 0) + ridge)
+        gain[chosen] = -1
+        best = int(gain.argmax())
+        chosen.append(best)
+        column = kernel[:, best].copy()
+        kernel -= np.outer(column, column) / (column[best] + ridge)
+    return np.array(chosen)
+
+
+def leverage(rows: np.ndarray, count: int, ridge: float = 1e-3) -> np.ndarray:
+    """Drawn with probabilities in proportion to ridge leverage scores, without replacement."""
+    gram = rows.T @ rows / len(rows) + ridge * np.eye(rows.shape[1])
+    score = np.einsum("ij,ji->i", rows, np.linalg.solve(gram, rows.T))
+    return np.random.default_rng(0).choice(len(rows), count, replace=False, p=score / score.sum())
+
+
 SHORT = ("k-centre", "facility")  # shown where they may matter, not along all of the curve
 WAYS = {"random": first, "active": choose_rows, "D-optimal": greatest_variance, "k-centre": farthest, "facility": facility}
+
+
+def of_others(pool: Pool, points: int, seeds: int) -> dict[str, dict[int, np.ndarray]]:
+    """Scores of all that was tried, at one number of lightings: (seeds, scores)."""
+    values, (count, _) = pool.values(points), OTHERS
+    rows, strength = directions(values[: pool.train]), (values[: pool.train] ** 2).sum((1, 2))
+    ways: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
+        **{way: lambda rows, _, choose=choose: choose(rows, count) for way, choose in WAYS.items()},
+        **{
+            f"ridge {ridge:g}": lambda rows, _, ridge=ridge: choose_rows(rows, count, ridge=ridge)
+            for ridge in (1e-4, 1e-3, 0.1)
+        },
+        "weighed": lambda rows, strength: weighed(rows, count, strength),
+        "leverage": lambda rows, _: leverage(rows, count),
+    }
+    found: dict[str, list[np.ndarray]] = {way: [] for way in ways}
+    for seed in range(seeds):
+        candidates = np.random.default_rng(seed).permutation(pool.train)[: EACH * count]
+        for way, choose in ways.items():
+            found[way].append(pool.scores(values, candidates[choose(rows[candidates], strength[candidates])]))
+    return {way: {count: np.array(trials)} for way, trials in found.items()}
 
 
 def of_lightings(pool: Pool, points: int, seeds: int, counts: tuple[int, ...]) -> dict[str, dict[int, np.ndarray]]:
@@ -155,19 +199,26 @@ def of_lightings(pool: Pool, points: int, seeds: int, counts: tuple[int, ...]) -
     return found
 
 
-def of_points(pool: Pool, seeds: int, counts: tuple[int, ...]) -> dict[str, dict[int, np.ndarray]]:
-    """Scores by way and number of points; all samples are shaded, whatever the number of points."""
+def by_qr(light: np.ndarray, count: int) -> np.ndarray:
+    rows = directions(light).reshape(light.shape)
+    return choose_columns(rows.swapaxes(1, 2).reshape(-1, rows.shape[1]), count)
+
+
+def of_points(pool: Pool, seeds: int, counts: tuple[int, ...], others: bool = False) -> dict[str, dict[int, np.ndarray]]:
+    """Scores by way and number of points; all samples are shaded, whatever the number of points, but for those "alone"."""
     found: dict[str, dict[int, np.ndarray]] = {"blue-noise": {}, "qr": {}}
-    light = pool.irradiance[: pool.train] * pool.data.samples.albedo
+    if others:
+        found |= {"qr irrad.": {}, "qr root": {}, "blue alone": {}, "qr alone": {}}
+    albedo = pool.data.samples.albedo
     for count in counts:
         for way, trials in found.items():
             scores = []
             for seed in range(seeds):
                 chosen = np.random.default_rng(seed).permutation(pool.train)[:TRAIN_OF_POINTS]
-                order = None
-                if way == "qr":
-                    rows = directions(light[chosen]).reshape(light[chosen].shape)
-                    order = choose_columns(rows.swapaxes(1, 2).reshape(-1, rows.shape[1]), count)
+                light = pool.irradiance[chosen]
+                by = {"qr": light * albedo, "qr alone": light * albedo, "qr irrad.": light, "qr root": np.sqrt(light * albedo)}
+                order = by_qr(by[way], count) if way in by else np.arange(len(albedo))
+                order = order[:count] if "alone" in way else order
                 scores.append(pool.scores(pool.values(count, order), chosen))
             trials[count] = np.array(scores)
     return found
@@ -218,10 +269,10 @@ def draw(lightings: dict, points: dict) -> None:
     figure.savefig("docs/active.png", dpi=90)
 
 
-def scene_scores(name: str, quick: bool, seeds: int, most: int) -> dict[str, dict[str, dict[int, np.ndarray]]]:
+def scene_scores(name: str, quick: bool, others: bool, seeds: int, most: int) -> dict[str, dict[str, dict[int, np.ndarray]]]:
     """Scores of a scene over lightings and over points, from an earlier run if there is one."""
     train, test = (256, 64) if quick else (2048, 256)
-    kept = Path("runs") / f"active-{name}-{train}-{seeds}-{most}.json"
+    kept = Path("runs") / f"active-{name}-{train}-{seeds}-{'others' if others else most}.json"
     if kept.is_file():
         found = json.loads(kept.read_text())
         return {
@@ -229,10 +280,11 @@ def scene_scores(name: str, quick: bool, seeds: int, most: int) -> dict[str, dic
             for over, both in found.items()
         }
     pool = Pool.of(name, train, test)
-    points = (32, 128) if quick else POINTS
+    shaded, numbers = SCENES[name][2], tuple(count for count in COUNTS if count <= most)
+    points = OTHERS[1] if quick or others else POINTS
     found = {
-        "lightings": of_lightings(pool, SCENES[name][2], seeds, tuple(count for count in COUNTS if count <= most)),
-        "points": of_points(pool, seeds, points),
+        "lightings": of_others(pool, shaded, seeds) if others else of_lightings(pool, shaded, seeds, numbers),
+        "points": of_points(pool, seeds, points, others),
     }
     plain = {
         over: {way: {n: of.tolist() for n, of in ways.items()} for way, ways in both.items()} for over, both in found.items()
@@ -244,19 +296,22 @@ def scene_scores(name: str, quick: bool, seeds: int, most: int) -> dict[str, dic
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--quick", action="store_true", help="one scene, a small pool, no picture")
-    parser.add_argument("--seeds", type=int, default=6)
-    parser.add_argument("--most", type=int, default=256, help="training lightings")
+    parser.add_argument("--others", action="store_true", help="all that was tried, at few sizes, no picture")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--most", type=int, default=128, help="training lightings")
     parser.add_argument("--only", choices=SCENES, help="one scene, no picture")
     asked = parser.parse_args()
-    quick = asked.quick
+    quick, others = asked.quick, asked.others
     seeds, most = (2, 32) if quick else (asked.seeds, asked.most)
     names = ["cornell"] if quick else [asked.only] if asked.only else list(SCENES)
     print(f"{'scene':13}{'over':10}{'':5}  {'way':11}" + "".join(f"{score:>8}" for score in SCORES) + "   spread of pooled")
     scores = {}
     for name in names:
-        scores[name] = scene_scores(name, quick, seeds, most)
+        scores[name] = scene_scores(name, quick, others, seeds, most)
         for over, found in scores[name].items():
             table(name, over, found)
+        if others:
+            continue
         found, yardstick = scores[name]["lightings"], min(128, most)
         wanted = mean(found["random"][yardstick])
         for place, score in enumerate(SCORES[:2]):
@@ -265,7 +320,7 @@ def main() -> None:
             print(
                 f"{name}: {score} error of {yardstick} random lightings ({wanted[place]:.4f}): reached by {reached}", flush=True
             )
-    if not quick and not asked.only:
+    if not quick and not others and not asked.only:
         draw(*({name: of[over] for name, of in scores.items()} for over in ("lightings", "points")))
         print("docs/active.png")
 
