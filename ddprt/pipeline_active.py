@@ -10,6 +10,7 @@ from pathlib import Path
 
 from ddprt.config import Config
 from ddprt.dataset.generate import bake
+from ddprt.dataset.splits import Once
 from ddprt.dataset.store import Dataset, read_description
 from ddprt.errors import UserError
 from ddprt.progress import Progress
@@ -35,17 +36,17 @@ def bake_to_target(scene: Scene, config: Config, folder: Path, progress: Progres
     """
     target, sizes = config.lightings.target_error, group_sizes(config.lightings.train)
     trials = folder.with_name(f"{folder.name}.trials")
-    count = _begun(folder, sizes)
+    count, once = _begun(folder, sizes), Once()
     if count is None:
         count = sizes[-1]
         fewest = config.transport.model_copy(update={"test_samples": _FEWEST})
         rough = config.model_copy(update={"transport": fewest})
         for size in sizes[:-1]:
-            trial = bake(scene, config=rough, out=trials / f"{size:06d}", first=size, progress=progress)
+            trial = bake(scene, config=rough, out=trials / f"{size:06d}", first=size, once=once, progress=progress)
             if _told(trial, config, progress) <= target:
                 count = size
                 break
-    data = bake(scene, config=config, out=folder, first=count, progress=progress)
+    data = bake(scene, config=config, out=folder, first=count, once=once, progress=progress)
     error = _told(data, config, progress)
     if error > target and count < sizes[-1]:
         raise UserError(

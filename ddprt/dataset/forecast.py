@@ -31,9 +31,9 @@ from ddprt.config import Config
 from ddprt.dataset import store
 from ddprt.dataset.denoise import find_denoiser
 from ddprt.dataset.forecast_indirect import expect_indirect
-from ddprt.dataset.generate import DEPTH, baked_settings, check_points
+from ddprt.dataset.generate import baked_settings, check_points
 from ddprt.dataset.sampled import Expected, Part, Sampled
-from ddprt.dataset.splits import choose_lightings, doubt
+from ddprt.dataset.splits import choose_lightings, doubt, sunk
 from ddprt.dataset.store import ATLAS_FILES, Manifest, map_name
 from ddprt.files import write_tensors
 from ddprt.lights import Lighting, lighting_json
@@ -155,7 +155,7 @@ def _foreseen(scene: Scene, config: Config, folder: Path, progress: Progress, be
         check_points(config, scene, atlas)
         wanted = config.points.count * config.points.supersample
         samples = place_samples(scene, wanted, on=config.points.on, seed=config.seed, atlas=atlas)
-    samples = replace(samples, depth=samples.spacing * _depth(config, samples.spacing, lightings, tracer, listed is not None))
+    samples = sunk(samples, lightings, config.points, tracer)
     staged("points")
     job = Sampled(scene, config, folder, progress, tracer, lightings, bounces, atlas, Manifest(folder), peak)
     placing, described = _placed(job, samples, entries)
@@ -176,14 +176,6 @@ def _foreseen(scene: Scene, config: Config, folder: Path, progress: Progress, be
     held_out = stages[-2].seconds + reading * len(test) + direct.seconds * lamps[1] / sum(lamps)
     shorter = sorted((part for part in parts if part.then < part.seconds), key=lambda part: -part.seconds)
     return Forecast(tuple(stages), sum(stage.seconds for stage in stages) - held_out, job.peak, tuple(shorter), 0.0)
-
-
-def _depth(config: Config, spacing: float, lightings: list[Lighting], tracer: Tracer, listed: bool) -> float:
-    """Depth of the samples in distances between them, as the bake decides on it: it makes measuring dearer."""
-    if config.points.depth != "auto":
-        return config.points.depth
-    lamps = [place for lighting in lightings for light in lighting if (place := light.anchor()) is not None]
-    return DEPTH if lamps and not listed and tracer.clearance(np.array(lamps)).min() < spacing else 0.0
 
 
 def _placed(job: Sampled, samples: Samples, entries: list[tuple[str, Lighting]]) -> tuple[float, int]:

@@ -10,8 +10,7 @@ import numpy as np
 from ddprt import seeds
 from ddprt.axes import Float32, Int
 from ddprt.dataset.denoise import denoised
-from ddprt.dataset.sampled import Expected, Number, Part, Sampled, extrapolated, on_a_line
-from ddprt.dataset.scratch import Scratch
+from ddprt.dataset.sampled import Expected, Number, Part, Sampled, extrapolated, on_a_line, scratched
 from ddprt.dataset.store import map_name, read_map, write_map
 from ddprt.lights import Lighting
 from ddprt.transport.direct import Texels
@@ -117,7 +116,7 @@ def _by_operator(job: Sampled, split: str, indices: list[int], seen: list[int], 
     column = 12 * operator.senders.count * count
     maps = 12 * halves * count * job.atlas.count
     job.holds(maps, column * (2 + 4 * test), (count - wide) * column / count * 2)
-    writing = _scratched(job, maps)
+    writing = scratched(job.folder, maps, _SCRATCH, job.tracer.threads)
     few = np.linspace(0, wide - 1, min(wide, _LOOKED_AT)).astype(int)
     light = bounced.radiosity.reshape(operator.senders.count, -1, 3)[:, few].reshape(operator.senders.count, -1)
     look = _Look(operator, np.ascontiguousarray(light), noise, choice.footprints.pooled if choice.footprints else None)
@@ -194,7 +193,11 @@ def _by_paths(job: Sampled, split: str, indices: list[int], seen: list[int], par
     parts.append(_fewer_rays(job, split, share * seconds, 1.0, float(samples)))
     maps = 12 * halves * count * atlas.count
     job.holds(maps)
-    return choosing + share * seconds + _scratched(job, maps), int(rays + share * some), _looked(job, seen, noise)
+    return (
+        choosing + share * seconds + scratched(job.folder, maps, _SCRATCH, job.tracer.threads),
+        int(rays + share * some),
+        _looked(job, seen, noise),
+    )
 
 
 def _by_reference(job: Sampled, split: str, indices: list[int], seen: list[int], parts: list[Part]) -> tuple[float, int, _Look]:
@@ -233,21 +236,6 @@ def _looked(job: Sampled, seen: list[int], noise: float) -> _Look:
     light = [read_map(job.folder / map_name("direct", index))[job.atlas.slot >= 0] for index in seen[:_LOOKED_AT]]
     direct = np.concatenate([operator.averaged(values) for values in light], 1)
     return _Look(operator, operator.bounce(direct, seed=job.config.seed, stream="look", bounces=1).radiosity, noise)
-
-
-def _scratched(job: Sampled, size: Number) -> float:
-    """Seconds that the disk takes for so many bytes of maps in the making."""
-    texels = max(1, int(min(size, _SCRATCH)) // 12)
-    noise = seeds.stream(0, "scratched").random((1, texels, 3), np.float32)
-    begun = time.perf_counter()
-    scratch = Scratch(job.folder / "sample.part", noise.shape, {})
-    reserved = time.perf_counter()
-    scratch.maps[:] = noise
-    filled = time.perf_counter()
-    scratch.note()
-    scratch.remove()
-    spent = time.perf_counter() - filled + reserved - begun + (filled - reserved) / job.tracer.threads
-    return spent * max(1.0, size / (12 * texels))
 
 
 def _stored(job: Sampled, kinds: list[str], indices: list[int], look: _Look | None) -> tuple[float, int]:

@@ -19,7 +19,7 @@ from ddprt.dataset import store
 from ddprt.dataset.denoise import find_denoiser
 from ddprt.dataset.indirect import IndirectBake
 from ddprt.dataset.scratch import remove_left
-from ddprt.dataset.splits import SPLITS, Splits, check_choice, choose_lightings, chosen, doubt, grouped
+from ddprt.dataset.splits import SPLITS, Once, Splits, check_choice, choose_lightings, chosen, doubt, grouped, sunk
 from ddprt.dataset.store import Dataset, Manifest, map_name
 from ddprt.errors import UserError
 from ddprt.files import alone_in, write_tensors
@@ -34,7 +34,6 @@ from ddprt.transport.embree import Tracer
 from ddprt.transport.measure import measure
 from ddprt.transport.openness import build_open_atlas
 
-DEPTH = 0.75  # of the distance between samples: what they mistake for a constant shrinks to 1.8 %
 _NAMED = 8  # doubtful lightings, or altered files, that a message spells out
 _TOLD = 4  # settings that differ and that a message spells out
 _WIDTH = 60  # characters of a value in a message
@@ -51,6 +50,7 @@ def bake(
     config: Config | None = None,
     out: str | Path | None = None,
     first: int | None = None,
+    once: Once | None = None,
     progress: Progress | None = None,
 ) -> Dataset:
     """Renders pairs of direct and indirect lightmaps.
@@ -68,6 +68,7 @@ def bake(
       out: folder; an unfinished bake of the same settings there goes on. None bakes into a temporary folder that lives as
         long as the dataset.
       first: of the training lightings that are chosen, bake only so many, the most telling; None bakes all.
+      once: of several bakes with this scene and these settings, whatever their `first`: candidates are drawn and measured once.
       progress: shown if given.
     Returns:
       The finished dataset.
@@ -96,7 +97,7 @@ def bake(
         config, lightings = config.model_copy(update={"lightings": asked}), None
     keep_alive = tempfile.TemporaryDirectory(prefix="ddprt-") if out is None else None
     folder = Path(keep_alive.name if keep_alive else str(out))
-    return _Bake(scene, config, folder, progress or Progress(quiet=True), first).run(lightings, keep_alive)
+    return _Bake(scene, config, folder, progress or Progress(quiet=True), first, once or Once()).run(lightings, keep_alive)
 
 
 def baked_settings(config: Config, scene: Scene) -> dict[str, Any]:
@@ -177,8 +178,10 @@ def _records(entries: Sequence[tuple[str, Lighting]]) -> list[dict[str, Any]]:
 class _Bake:
     """One bake from start to end; every stage skips what the manifest already holds."""
 
-    def __init__(self, scene: Scene, config: Config, folder: Path, progress: Progress, first: int | None) -> None:
+    def __init__(self, scene: Scene, config: Config, folder: Path, progress: Progress, first: int | None, once: Once) -> None:
         self.scene, self.config, self.folder, self.progress, self.first = scene, config, folder, progress, first
+        self.once = once
+        once.bind(scene.digest, config.model_dump_json(include={"seed", "atlas", "lightings", "points"}))
         self.tracer = Tracer.of(scene, config.transport.threads)
 
     def run(self, given: Sequence[Lighting] | Splits | None, keep_alive: Any) -> Dataset:
@@ -195,7 +198,8 @@ class _Bake:
             self._refuse_altered()
         listed = self._listed()
         with self.progress.stage("lightings") as stage:
-            entries, drawn = choose_lightings(given, self.config.lightings, self.scene, self.tracer, self.config.seed)
+            asked = given, self.config.lightings, self.scene, self.tracer, self.config.seed
+            entries, drawn = self.once("lightings", lambda: choose_lightings(*asked))
             stage.facts |= {"lightings": len(entries), **drawn}
         lightings = [lighting for _, lighting in entries]
         listed = listed and self._sunk(listed, lightings)
@@ -212,7 +216,7 @@ class _Bake:
             stage.facts |= {"samples": len(samples.position), "depth": round(samples.depth, 6)}
         if active or self.config.points.choose == "qr":
             with self.progress.stage("choose") as stage:
-                entries, samples, shadow_rays = chosen(entries, samples, self.config, self.tracer, self.first)
+                entries, samples, shadow_rays = chosen(entries, samples, self.config, self.tracer, self.first, self.once)
                 stage.facts |= {"train": sum(split == "train" for split, _ in entries), "shadow_rays": shadow_rays}
             lightings = [lighting for _, lighting in entries]
         effects = plan(self.scene, lightings, bounces=self.config.transport.bounces)
@@ -304,14 +308,7 @@ class _Bake:
         return place_samples(self.scene, config.count * config.supersample, on=config.on, seed=self.config.seed, atlas=atlas)
 
     def _sunk(self, samples: Samples, lightings: Sequence[Lighting]) -> Samples:
-        """Samples that are lit from behind their surface where lamps are nearer to one than samples to each other."""
-        depth = self.config.points.depth
-        if depth == "auto":
-            lamps = [place for lighting in lightings for light in lighting if (place := light.anchor()) is not None]
-            asked = bool(lamps) and not self.config.points.file  # given points may stand in the open, at any distance
-            near = asked and self.tracer.clearance(np.array(lamps)).min() < samples.spacing
-            depth = DEPTH if near else 0.0
-        return replace(samples, depth=depth * samples.spacing)
+        return self.once("depth", lambda: sunk(samples, lightings, self.config.points, self.tracer))
 
     def _write_places(self, manifest: Manifest, atlas: Atlas, samples: Samples) -> None:
         """Points, occluders and the G-buffer, unless they are there."""

@@ -11,6 +11,7 @@ from ddprt import seeds
 from ddprt.axes import Float32, Int
 from ddprt.config import Config
 from ddprt.dataset.denoise import denoised
+from ddprt.dataset.sampled import scratched, stored
 from ddprt.dataset.scratch import Scratch
 from ddprt.dataset.store import Dataset, Manifest, map_name, read_map, write_map
 from ddprt.progress import Progress, Stage
@@ -19,7 +20,9 @@ from ddprt.scene.mesh import Scene
 from ddprt.transport.direct import Texels
 from ddprt.transport.effects import Plan
 from ddprt.transport.embree import Tracer
+from ddprt.transport.footprint import Footprints
 
+_SHARE, _LARGE = 64, 1 << 26  # of maps in the making that is tried out; bytes below which they take no time that matters
 _REFERENCE_SAMPLES = 512  # paths of the reference where nothing else is asked for
 
 
@@ -81,7 +84,8 @@ class IndirectBake:
                 chosen = choose_rays(operator, bounced.radiosity, config, held_out=test, **address)
                 rays, footprints = chosen.rays, chosen.footprints
                 stage.facts |= chosen.facts | self._facts(bounced, operator)
-                spent = time.perf_counter() - begun + (len(kinds) - 1) * bouncing  # each half bounces its own light
+                storing = self._storing(indices, todo, kinds, chosen.facts["noise_expected"], footprints)
+                spent = storing + time.perf_counter() - begun + (len(kinds) - 1) * bouncing  # each half bounces its own light
                 stage.facts["seconds_expected"] = float(f"{chosen.facts['seconds_expected'] + spent:.2g}")
                 stage.pace(len(kinds) * int(rays.sum()))
                 given, expected = config.test_samples if test else config.samples, chosen.facts["noise_expected"]
@@ -96,6 +100,23 @@ class IndirectBake:
             )
             parts.append(scratch)
         self._finish(parts, indices, todo, kinds, footprints.pooled if footprints else lambda light: light)
+
+    def _storing(
+        self, indices: list[int], todo: list[int], kinds: list[str], noise: float, footprints: Footprints | None
+    ) -> float:
+        """Seconds that maps will take, in the making and as files: told by direct light with the noise that they will have."""
+        light = read_map(self.dataset.folder / map_name("direct", indices[0]))[self.dataset.covered]
+        dither = light * (noise * seeds.stream(0, "storing").standard_normal(light.shape, np.float32))
+        maps = [np.maximum(light + dither, 0), dither][: len(kinds)]
+        filtered, threads = self.config.transport.denoise and len(kinds) == 1, self.tracer.threads
+
+        def made(values: np.ndarray) -> np.ndarray:
+            smooth = footprints.pooled(values) if footprints else values
+            return denoised(self.atlas, smooth) if filtered else smooth
+
+        size = 12 * len(kinds) * len(indices) * self.atlas.count
+        writing = scratched(self.dataset.folder, size, size // _SHARE, threads) if size >= _LARGE else 0.0
+        return writing + len(todo) * stored(self.dataset.folder, self.atlas, maps, made, threads)
 
     def _follow(self, scratch: Scratch, tiles: Iterator[int], stage: Stage, rays: Int[np.ndarray, " texels"]) -> None:
         """Follows tiles of texels; a step is a ray, since texels with few rays come first and tell little about the others."""

@@ -5,10 +5,16 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
+import numpy as np
+
+from ddprt import seeds
+from ddprt.axes import Float32
 from ddprt.config import Config
-from ddprt.dataset.store import Manifest
+from ddprt.dataset.scratch import Scratch, remove_left
+from ddprt.dataset.store import Manifest, write_map
+from ddprt.files import sha256, write_text
 from ddprt.lights import Lighting
 from ddprt.machine import peak_memory_gib
 from ddprt.progress import Progress
@@ -16,6 +22,7 @@ from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
 from ddprt.transport.embree import Tracer
 
+SAMPLE = "sample-0.part"  # a file that is timed and goes
 PATIENCE = 0.7  # seconds after which no further sample of a kind is taken
 
 Number = float | int
@@ -134,6 +141,45 @@ class Sampled:
     def holds(self, *sizes: Number) -> None:
         """So many bytes are needed beside what is held now."""
         self.peak = max(self.peak, resident() + sum(sizes) / 2**30)
+
+
+def scratched(folder: Path, size: Number, most: Number, threads: int) -> float:
+    """Seconds that the disk takes for so many bytes of maps in the making, from at most `most` of them."""
+    texels = max(1, int(min(size, most)) // 12)
+    noise = seeds.stream(0, "scratched").random((1, texels, 3), np.float32)
+    begun = time.perf_counter()
+    scratch = Scratch(folder / SAMPLE, noise.shape, {})
+    reserved = time.perf_counter()
+    scratch.maps[:] = noise
+    filled = time.perf_counter()
+    scratch.note()
+    scratch.remove()
+    spent = time.perf_counter() - filled + reserved - begun + (filled - reserved) / threads
+    return spent * max(1.0, size / (12 * texels))
+
+
+def stored(
+    folder: Path, atlas: Atlas, maps: Sequence[Float32[np.ndarray, "texels 3"]], made: Callable[[Any], Any], threads: int
+) -> float:
+    """Seconds that the files of a lighting take, from one that is made and removed again.
+
+    Args:
+      folder: on the disk that files will be written to.
+      atlas: where texels lie in a map.
+      maps: what is stored, a file each.
+      made: what is done to each before.
+      threads: that make and compress files side by side; hashes are taken one after the other.
+    """
+    path, begun = folder / SAMPLE, time.perf_counter()
+    hashing = 0.0
+    for values in maps:
+        write_map(path, atlas.image(made(values)))
+        whole = time.perf_counter()
+        write_text(path.with_suffix(".json"), sha256(path))
+        hashing += time.perf_counter() - whole
+    spent = time.perf_counter() - begun
+    remove_left(path)
+    return (spent - hashing) / threads + hashing
 
 
 def resident() -> float:

@@ -1,7 +1,8 @@
-"""Which lightings a dataset has (given, listed in a file, drawn, or chosen among many), and which of them are doubtful."""
+"""Which lightings a dataset has (given, listed in a file, drawn, or chosen among many), which are doubtful, and what they ask of samples."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -16,14 +17,40 @@ from ddprt.sampling.lightings import draw_lightings
 from ddprt.sampling.points import Samples
 from ddprt.scene.distance import distance_within
 from ddprt.scene.mesh import Scene
-from ddprt.sections import LightingsConfig
+from ddprt.sections import LightingsConfig, PointsConfig
 from ddprt.transport.embree import Tracer
 from ddprt.transport.measure import measure
 
 SPLITS = ("train", "validation", "test")
 Splits = Mapping[str, Sequence[Lighting]]
+Result = TypeVar("Result")
 
+DEPTH = 0.75  # of the distance between samples: what they mistake for a constant shrinks to 1.8 %
 _STRENGTHS = ("intensity", "irradiance", "radiance")
+
+
+class Once:
+    """Steps that bakes of one scene and its settings share."""
+
+    def __init__(self) -> None:
+        self._shared: tuple[object, ...] = ()
+        self._found: dict[str, Any] = {}
+
+    def bind(self, *shared: object) -> None:
+        """Makes sure that what is kept depends on nothing else than it did.
+
+        Raises:
+          ValueError: it would.
+        """
+        if self._shared and self._shared != shared:
+            raise ValueError("once: got another scene or other settings, expected those that it was first used with")
+        self._shared = shared
+
+    def __call__(self, step: str, work: Callable[[], Result]) -> Result:
+        """What a step came to; it is worked out when it is first asked for, and kept."""
+        if step not in self._found:
+            self._found[step] = work()
+        return cast("Result", self._found[step])
 
 
 def choose_lightings(
@@ -91,7 +118,12 @@ def check_choice(config: Config, first: int | None) -> None:
 
 
 def chosen(
-    entries: Sequence[tuple[str, Lighting]], samples: Samples, config: Config, tracer: Tracer, first: int | None
+    entries: Sequence[tuple[str, Lighting]],
+    samples: Samples,
+    config: Config,
+    tracer: Tracer,
+    first: int | None,
+    once: Once,
 ) -> tuple[list[tuple[str, Lighting]], Samples, int]:
     """What a configuration chooses: entries with fewer training lightings, samples with the points first; shadow rays spent.
 
@@ -101,15 +133,33 @@ def chosen(
       config: all settings.
       tracer: the occluders.
       first: of the chosen lightings, keep only so many; None keeps all.
+      once: keeps the choice, of which any number is a beginning.
     """
     train = [lighting for split, lighting in entries if split == "train"]
     points, seed, before = config.points.count, config.seed, tracer.rays
     if config.lightings.choose == "active":
-        train = choose_among(train, config.lightings.train, samples, points, tracer, seed)[:first]
+        asked = train, config.lightings.train, samples, points, tracer, seed
+        train = once("choice", lambda: choose_among(*asked))[:first]
     if config.points.choose == "qr":
         samples = reorder(samples, train, points, tracer, seed)
     held = [entry for entry in entries if entry[0] != "train"]
     return [*(("train", lighting) for lighting in train), *held], samples, tracer.rays - before
+
+
+def sunk(samples: Samples, lightings: Sequence[Lighting], config: PointsConfig, tracer: Tracer) -> Samples:
+    """Samples that are lit from behind their surface where lamps are nearer to one than samples to each other.
+
+    Args:
+      samples, tracer: where light is measured, and what occludes it.
+      lightings: all, those among which training ones are yet to be chosen too.
+      config: of the points; a depth that it gives is taken.
+    """
+    depth = config.depth
+    if depth == "auto":
+        lamps = [place for lighting in lightings for light in lighting if (place := light.anchor()) is not None]
+        asked = bool(lamps) and not config.file  # given points may stand in the open, at any distance
+        depth = DEPTH if asked and tracer.clearance(np.array(lamps)).min() < samples.spacing else 0.0
+    return replace(samples, depth=depth * samples.spacing)
 
 
 def choose_among(
