@@ -7,6 +7,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,15 +18,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ddprt import pipeline_active
 from ddprt.config import Config
 from ddprt.dataset.generate import bake, other_settings
-from ddprt.dataset.splits import choose_among, reorder
+from ddprt.dataset.splits import Once, choose_among, reorder
 from ddprt.dataset.store import Dataset, open_dataset
 from ddprt.errors import UserError
 from ddprt.lights import PointLight
 from ddprt.pipeline import Run
 from ddprt.pipeline_active import FIRST_GROUP, group_sizes
-from ddprt.progress import Progress
+from ddprt.progress import Progress, Stage
 from ddprt.sampling.design import RIDGE, choose_columns, choose_rows, directions
 from ddprt.sampling.lightings import draw_lightings
 from ddprt.sampling.points import place_samples
@@ -219,6 +222,7 @@ def test_points_by_qr_are_the_same_samples(cornell: Scene, active: Dataset) -> N
     assert data.samples.depth == active.samples.depth
 
 
+@pytest.mark.slow
 def test_a_killed_bake_goes_on(active: Dataset, tmp_path: Path) -> None:
     """Killed by the system at several moments; the end is the same to the bit."""
     config, folder = tmp_path / "config.toml", tmp_path / "run"
@@ -279,21 +283,76 @@ def test_a_stopped_bake_is_found_finished(stopped: Path, tmp_path: Path) -> None
         tighter.bake()
 
 
-def test_a_target_out_of_reach_bakes_all_and_says_so(tmp_path: Path) -> None:
-    lines = list[str]()
-    run = Run(small(lightings={**GROWING, "target_error": 1e-6}), tmp_path / "run", quiet=True)
-    run.progress = _Listening(lines)
-    assert len(run.bake().split("train")) == FIRST_GROUP + 2
-    assert any("with all 18 training lightings, expected at most 1e-06" in line for line in lines)
-
-
 class _Listening(Progress):
-    def __init__(self, lines: list[str]) -> None:
+    """Keeps warnings, and how many rays had been traced when each stage began and ended."""
+
+    def __init__(self, lines: list[str], traced: Callable[[], int]) -> None:
         super().__init__(quiet=True)
-        self.lines = lines
+        self.lines, self.traced, self.rays = lines, traced, dict[str, list[int]]()
 
     def warn(self, line: str) -> None:
         self.lines.append(line)
+
+    @contextmanager
+    def stage(self, name: str, total: int = 0) -> Iterator[Stage]:
+        before = self.traced()
+        with super().stage(name, total) as stage:
+            yield stage
+        self.rays.setdefault(name, []).append(self.traced() - before)
+
+
+@pytest.fixture
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Rays that all tracers have traced so far."""
+    total, count = [0], Tracer._count
+
+    def counting(tracer: Tracer, rays: int) -> None:
+        count(tracer, rays)
+        total[0] += rays
+
+    monkeypatch.setattr(Tracer, "_count", counting)
+    return total
+
+
+def test_a_target_out_of_reach_bakes_all_says_so_and_goes_on(
+    cornell: Scene, counted: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stopped once 16 were found too few; the second run, too, draws and measures candidates once for both its bakes."""
+    config, told = small(lightings={**GROWING, "target_error": 1e-6}, points={"choose": "qr"}), pipeline_active._told
+
+    def stopped_later(data: Dataset, *rest: Any) -> float:
+        told(data, *rest)
+        raise KeyboardInterrupt
+
+    spent = []
+    for last in (False, True):
+        run, lines = Run(config, tmp_path / "run", quiet=True), list[str]()
+        run.progress = progress = _Listening(lines, lambda: counted[0])
+        with monkeypatch.context() as patch, nullcontext() if last else pytest.raises(KeyboardInterrupt):
+            if not last:
+                patch.setattr(pipeline_active, "_told", stopped_later)
+            data = run.bake()
+        spent.append({name: progress.rays[name] for name in ("lightings", "points", "choose")})
+    first, second = spent
+    assert [len(rays) for rays in first.values()] == [1, 1, 1]
+    for name, rays in second.items():
+        assert len(rays) == 2
+        assert rays[0] == first[name][0] > 0, "nothing is left of what a stopped run had measured"
+    assert second["lightings"][1] == second["points"][1] == 0
+    most = SMALL["points"]["count"] * SMALL["points"]["supersample"] * (FIRST_GROUP + 2)  # one shadow ray each, or none
+    assert 0 < second["choose"][1] <= most < second["choose"][0], "of the second, only for its points"
+    assert len(data.split("train")) == FIRST_GROUP + 2
+    assert any("with all 18 training lightings, expected at most 1e-06" in line for line in lines)
+    at_once = bake(cornell, config=config, first=FIRST_GROUP + 2)
+    assert at_once.description == data.description
+    np.testing.assert_array_equal(at_once.maps("indirect", range(22)), data.maps("indirect", range(22)))
+
+
+def test_steps_are_shared_by_bakes_of_the_same_alone(cornell: Scene) -> None:
+    once = Once()
+    bake(cornell, config=small(), first=1, once=once)
+    with pytest.raises(ValueError, match="got another scene or other settings"):
+        bake(cornell, config=small(points={"count": 7}), first=1, once=once)
 
 
 ONE = [(PointLight(position=(0.3, 0.4, 0.3), intensity=(1, 1, 1)),)] * 4

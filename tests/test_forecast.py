@@ -117,10 +117,10 @@ def test_files_and_rays_come_as_foretold(scene: str, transport: dict[str, Any], 
 @pytest.mark.parametrize(
     ("transport", "wide"),
     [
-        ({"samples": 64, "test_samples": 256}, 512),
         ({"samples": 64, "test_samples": 256}, 16),
+        pytest.param({"samples": 64, "test_samples": 256}, 512, marks=pytest.mark.slow),
         ({"integrator": "paths"}, 512),
-        ({"integrator": "reference"}, 512),
+        pytest.param({"integrator": "reference"}, 512, marks=pytest.mark.slow),
     ],
 )
 def test_every_ray_of_a_bake_is_in_its_forecast(

@@ -40,7 +40,7 @@ def data(tmp_path: Path) -> Dataset:
     manifest = Manifest(folder)
     write_exr(folder / "atlas" / "coverage.exr", covered.astype(np.float32))
     manifest.add("atlas/coverage.exr")
-    for index, exposure in zip(range(COUNT), (0, 100, -110, -130, 3), strict=True):
+    for index, exposure in zip(range(COUNT), (0, 100, -110, -130, 110), strict=True):
         write_map(folder / map_name("indirect", index), light(index, exposure))
         manifest.add(map_name("indirect", index))
     return Dataset(folder, json.loads((folder / "dataset.json").read_text()))
@@ -71,6 +71,7 @@ def test_a_pack_has_the_bits_of_the_maps(data: Dataset, monkeypatch: pytest.Monk
     maps = data.maps("indirect", range(COUNT))
     assert (np.abs(maps[maps != 0]) < np.finfo(np.float32).tiny).any(), "nothing subnormal is among it"
     pack = packed(data)
+    assert pack.exposures[3] < -packing._NORMAL, "no power of two among it is past a normal float32"
     assert pack.path.name == "indirect.f16"
     assert pack.path.stat().st_size == maps.size * 2
     monkeypatch.setattr("ddprt.dataset.store.read_exr", None)

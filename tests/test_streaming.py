@@ -6,11 +6,14 @@ rounding; bounds stand beside.
 """
 
 import gc
+import itertools
 import json
+import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +42,7 @@ def data(cornell: Scene, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """A box of 5128 texels or so: with 8 lightings, six tiles of which the last is not whole."""
     out = tmp_path_factory.mktemp("streaming") / "dataset"
     few = {"lightings.train": "8", "lightings.validation": "4", "lightings.test": "2"}
+    few |= {"transport.samples": "16", "transport.test_samples": "16"}
     config = load_config(None, {"atlas.resolution": "80", "points.count": "24", "points.supersample": "1", **few})
     return bake(cornell, config=config, out=out)
 
@@ -54,10 +58,18 @@ def fitted(data: Dataset, stream: bool, **settings: object) -> Model:
     return train.fit_method(data, config, "svd-ridge", {}, points=None, quantity="radiosity", seed=0, stream=stream)
 
 
+def slow_unless(fast: Sequence[tuple[object, ...]], *choices: Sequence[object]) -> list[Any]:
+    """All combinations, of which few are tried each time."""
+    return [pytest.param(*one, marks=[] if one in fast else [pytest.mark.slow]) for one in itertools.product(*choices)]
+
+
+WAYS = slow_unless(
+    [("linear", "mono", "none"), ("gamma", "multi", "mean")], ["linear", "gamma"], ["mono", "multi"], ["none", "mean"]
+)
+
+
 @pytest.mark.usefixtures("small_blocks")
-@pytest.mark.parametrize("centre", ["none", "mean"])
-@pytest.mark.parametrize("channels", ["mono", "multi"])
-@pytest.mark.parametrize("space", ["linear", "gamma"])
+@pytest.mark.parametrize(("space", "channels", "centre"), WAYS)
 def test_a_streamed_fit_is_the_fit_in_memory(data: Dataset, space: str, channels: str, centre: str) -> None:
     held, streamed = (fitted(data, way, space=space, channels=channels, centre=centre) for way in (False, True))
     assert streamed.relighter.report == held.relighter.report
@@ -131,9 +143,15 @@ def deep(columns: int, entries: int, depth: float) -> np.ndarray:
     return (rng.standard_normal((columns, 20)) * strengths @ rng.standard_normal((20, entries))).astype(np.float32)
 
 
-@pytest.mark.parametrize("centre", [False, True])
-@pytest.mark.parametrize("depth", [1e-2, 1e-8], ids=["shallow", "deep"])
-@pytest.mark.parametrize("entries", [5 * 1024, 4 * 1024 + 77, 900])
+BLOCKS = slow_unless(
+    [(4 * 1024 + 77, 1e-2, False), (4 * 1024 + 77, 1e-8, True), (900, 1e-2, True)],
+    [5 * 1024, 4 * 1024 + 77, 900],
+    [1e-2, 1e-8],
+    [False, True],
+)
+
+
+@pytest.mark.parametrize(("entries", "depth", "centre"), BLOCKS)
 def test_blocks_do_not_change_a_bit(entries: int, depth: float, centre: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     columns = deep(40, entries, depth)
     weights = jnp.asarray(np.random.default_rng(1).random(entries, np.float32) / entries)
@@ -219,6 +237,7 @@ streaming.child(path, texels, "streamed")
 """
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_light(tmp_path: Path) -> None:
     """Peak of a streamed fit of 60 000 texels x 128 lightings, blocks of 4 MiB, in a process of its own.
 
@@ -275,6 +294,11 @@ def test_a_second_command_finds_what_the_first_compiled(tmp_path: Path, monkeypa
     assert not second.stderr
     assert first.stdout.split()[1] == second.stdout.split()[1]  # the same bits
     assert float(second.stdout.split()[0]) < float(first.stdout.split()[0])
+    for path in (tmp_path / "cache").glob("jax-*/*-cache"):
+        os.truncate(path, path.stat().st_size // 2)
+    cut = run()  # as a killed command leaves them: JAX says so, and compiles again
+    assert "Error reading persistent compilation cache entry" in cut.stderr
+    assert cut.stdout.split()[1] == first.stdout.split()[1]
 
 
 def test_a_cache_that_cannot_be_written_costs_time_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -283,6 +307,4 @@ def test_a_cache_that_cannot_be_written_costs_time_alone(tmp_path: Path, monkeyp
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
     monkeypatch.delitem(sys.modules, "jax")
     cli._keep_compiled()
-    import os
-
     assert "JAX_COMPILATION_CACHE_DIR" not in os.environ

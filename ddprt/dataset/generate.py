@@ -19,7 +19,7 @@ from ddprt.dataset import store
 from ddprt.dataset.denoise import find_denoiser
 from ddprt.dataset.indirect import IndirectBake
 from ddprt.dataset.scratch import remove_left
-from ddprt.dataset.splits import SPLITS, Once, Splits, check_choice, choose_lightings, chosen, doubt, grouped, sunk
+from ddprt.dataset.splits import SPLITS, Once, Splits, check_choice, choose_lightings, chosen, doubt, grouped
 from ddprt.dataset.store import Dataset, Manifest, map_name
 from ddprt.errors import UserError
 from ddprt.files import alone_in, write_tensors
@@ -28,12 +28,14 @@ from ddprt.progress import Progress
 from ddprt.sampling.points import Samples, load_samples, place_samples
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
+from ddprt.sections import PointsConfig
 from ddprt.transport.direct import Texels
 from ddprt.transport.effects import Plan, plan
 from ddprt.transport.embree import Tracer
 from ddprt.transport.measure import measure
 from ddprt.transport.openness import build_open_atlas
 
+DEPTH = 0.75  # of the distance between samples: what they mistake for a constant shrinks to 1.8 %
 _NAMED = 8  # doubtful lightings, or altered files, that a message spells out
 _TOLD = 4  # settings that differ and that a message spells out
 _WIDTH = 60  # characters of a value in a message
@@ -171,6 +173,21 @@ def check_points(config: Config, scene: Scene, atlas: Atlas) -> None:
         )
 
 
+def sunk(samples: Samples, lightings: Sequence[Lighting], config: PointsConfig, tracer: Tracer) -> Samples:
+    """Samples that are lit from behind their surface where lamps are nearer to one than samples to each other.
+
+    Args:
+      samples, tracer: where light is measured, and what occludes it.
+      lightings, config: all, those that are yet to be chosen among too; of the points, whose own depth is taken if given.
+    """
+    depth = config.depth
+    if depth == "auto":
+        lamps = [place for lighting in lightings for light in lighting if (place := light.anchor()) is not None]
+        asked = bool(lamps) and not config.file  # given points may stand in the open, at any distance
+        depth = DEPTH if asked and tracer.clearance(np.array(lamps)).min() < samples.spacing else 0.0
+    return replace(samples, depth=depth * samples.spacing)
+
+
 def _records(entries: Sequence[tuple[str, Lighting]]) -> list[dict[str, Any]]:
     return [{"split": split, "lights": lighting_json(lighting)} for split, lighting in entries]
 
@@ -180,9 +197,8 @@ class _Bake:
 
     def __init__(self, scene: Scene, config: Config, folder: Path, progress: Progress, first: int | None, once: Once) -> None:
         self.scene, self.config, self.folder, self.progress, self.first = scene, config, folder, progress, first
-        self.once = once
         once.bind(scene.digest, config.model_dump_json(include={"seed", "atlas", "lightings", "points"}))
-        self.tracer = Tracer.of(scene, config.transport.threads)
+        self.tracer, self.once = Tracer.of(scene, config.transport.threads), once
 
     def run(self, given: Sequence[Lighting] | Splits | None, keep_alive: Any) -> Dataset:
         if self.config.transport.denoise:
@@ -198,8 +214,8 @@ class _Bake:
             self._refuse_altered()
         listed = self._listed()
         with self.progress.stage("lightings") as stage:
-            asked = given, self.config.lightings, self.scene, self.tracer, self.config.seed
-            entries, drawn = self.once("lightings", lambda: choose_lightings(*asked))
+            config = self.config.lightings
+            entries, drawn = self.once(choose_lightings, given, config, self.scene, self.tracer, self.config.seed)
             stage.facts |= {"lightings": len(entries), **drawn}
         lightings = [lighting for _, lighting in entries]
         listed = listed and self._sunk(listed, lightings)
@@ -208,8 +224,7 @@ class _Bake:
             points = {"points": self._points(listed)} if listed else {}
             self._refuse_other(there, {"counts": _counts(_records(entries)), "lightings": _records(entries), **points})
         with self.progress.stage("atlas") as stage:
-            settings = self.config.atlas
-            atlas, hidden = build_open_atlas(self.tracer, self.scene, settings.resolution, settings.padding)
+            atlas, hidden = build_open_atlas(self.tracer, self.scene, self.config.atlas.resolution, self.config.atlas.padding)
             stage.facts |= {"texels": atlas.count, "texels_per_metre": float(f"{atlas.texels_per_metre:.4g}"), **hidden}
         with self.progress.stage("points") as stage:
             samples = listed or self._sunk(self._placed(atlas), lightings)
@@ -308,7 +323,7 @@ class _Bake:
         return place_samples(self.scene, config.count * config.supersample, on=config.on, seed=self.config.seed, atlas=atlas)
 
     def _sunk(self, samples: Samples, lightings: Sequence[Lighting]) -> Samples:
-        return self.once("depth", lambda: sunk(samples, lightings, self.config.points, self.tracer))
+        return self.once(sunk, samples, lightings, self.config.points, self.tracer)
 
     def _write_places(self, manifest: Manifest, atlas: Atlas, samples: Samples) -> None:
         """Points, occluders and the G-buffer, unless they are there."""

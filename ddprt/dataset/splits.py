@@ -1,8 +1,8 @@
-"""Which lightings a dataset has (given, listed in a file, drawn, or chosen among many), which are doubtful, and what they ask of samples."""
+"""Which lightings a dataset has (given, listed in a file, drawn, or chosen among many), and which of them are doubtful."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, TypeVar, cast
+from typing import Any, ParamSpec, TypeVar, cast
 
 import numpy as np
 
@@ -17,15 +17,15 @@ from ddprt.sampling.lightings import draw_lightings
 from ddprt.sampling.points import Samples
 from ddprt.scene.distance import distance_within
 from ddprt.scene.mesh import Scene
-from ddprt.sections import LightingsConfig, PointsConfig
+from ddprt.sections import LightingsConfig
 from ddprt.transport.embree import Tracer
 from ddprt.transport.measure import measure
 
 SPLITS = ("train", "validation", "test")
 Splits = Mapping[str, Sequence[Lighting]]
+Given = ParamSpec("Given")
 Result = TypeVar("Result")
 
-DEPTH = 0.75  # of the distance between samples: what they mistake for a constant shrinks to 1.8 %
 _STRENGTHS = ("intensity", "irradiance", "radiance")
 
 
@@ -46,11 +46,11 @@ class Once:
             raise ValueError("once: got another scene or other settings, expected those that it was first used with")
         self._shared = shared
 
-    def __call__(self, step: str, work: Callable[[], Result]) -> Result:
-        """What a step came to; it is worked out when it is first asked for, and kept."""
-        if step not in self._found:
-            self._found[step] = work()
-        return cast("Result", self._found[step])
+    def __call__(self, step: Callable[Given, Result], *args: Given.args, **named: Given.kwargs) -> Result:
+        """What a step came to when it was first asked for; it is not taken again."""
+        if step.__name__ not in self._found:
+            self._found[step.__name__] = step(*args, **named)
+        return cast("Result", self._found[step.__name__])
 
 
 def choose_lightings(
@@ -138,28 +138,11 @@ def chosen(
     train = [lighting for split, lighting in entries if split == "train"]
     points, seed, before = config.points.count, config.seed, tracer.rays
     if config.lightings.choose == "active":
-        asked = train, config.lightings.train, samples, points, tracer, seed
-        train = once("choice", lambda: choose_among(*asked))[:first]
+        train = once(choose_among, train, config.lightings.train, samples, points, tracer, seed)[:first]
     if config.points.choose == "qr":
         samples = reorder(samples, train, points, tracer, seed)
     held = [entry for entry in entries if entry[0] != "train"]
     return [*(("train", lighting) for lighting in train), *held], samples, tracer.rays - before
-
-
-def sunk(samples: Samples, lightings: Sequence[Lighting], config: PointsConfig, tracer: Tracer) -> Samples:
-    """Samples that are lit from behind their surface where lamps are nearer to one than samples to each other.
-
-    Args:
-      samples, tracer: where light is measured, and what occludes it.
-      lightings: all, those among which training ones are yet to be chosen too.
-      config: of the points; a depth that it gives is taken.
-    """
-    depth = config.depth
-    if depth == "auto":
-        lamps = [place for lighting in lightings for light in lighting if (place := light.anchor()) is not None]
-        asked = bool(lamps) and not config.file  # given points may stand in the open, at any distance
-        depth = DEPTH if asked and tracer.clearance(np.array(lamps)).min() < samples.spacing else 0.0
-    return replace(samples, depth=depth * samples.spacing)
 
 
 def choose_among(
