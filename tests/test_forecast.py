@@ -142,6 +142,49 @@ def test_every_ray_of_a_bake_is_in_its_forecast(
     assert found.seconds == pytest.approx(sum(stage.seconds for stage in found.stages))
 
 
+def test_a_stage_expects_what_its_files_take(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A clock that only maps, hashes and maps in the making move, on one thread: a stage then takes what it expected."""
+    now = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+
+    def costs(name: str, seconds: float) -> None:
+        module, _, called = name.rpartition(".")
+        work = getattr(sys.modules[module], called)
+
+        def slow(*given: Any, **named: Any) -> Any:
+            now[0] += seconds
+            return work(*given, **named)
+
+        monkeypatch.setattr(name, slow)
+
+    for room in ("indirect", "sampled"):
+        costs(f"ddprt.dataset.{room}.write_map", 8.0)
+    for room in ("sampled", "store"):
+        costs(f"ddprt.dataset.{room}.sha256", 3.0)
+    progress = Progress(quiet=True)
+    bake(ddprt.load_scene("plates"), config=config_of(transport={"threads": 1}), out=tmp_path / "data", progress=progress)
+    stages = {str(stage["name"]): stage for stage in progress.stages if "seconds_expected" in stage}
+    for name, maps in (("indirect train", 8), ("indirect test", 6)):
+        sample = 11 * (1 if name == "indirect train" else 2)
+        assert stages[name]["seconds"] == 11 * maps + sample
+        assert stages[name]["seconds_expected"] == pytest.approx(stages[name]["seconds"], rel=0.05)  # told in two digits
+    assert not [*(tmp_path / "data").glob("*.part")]
+
+
+def test_a_large_stage_expects_its_maps_in_the_making(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """They are tried out at a share of their size; below a size they count for nothing."""
+    asked: list[tuple[int, int]] = []
+    monkeypatch.setattr("ddprt.dataset.indirect.scratched", lambda _, size, most, __: asked.append((size, most)) or 5000.0)
+    progress = Progress(quiet=True)
+    monkeypatch.setattr("ddprt.dataset.indirect._LARGE", 12 * 8 * 1024)  # 8 training maps of 32² texels, of which few are bare
+    monkeypatch.setattr("ddprt.dataset.indirect._SHARE", 4)
+    bake(ddprt.load_scene("plates"), config=config_of(side=32, counts=(20, 4, 2)), out=tmp_path / "data", progress=progress)
+    stages = {str(stage["name"]): stage for stage in progress.stages if "seconds_expected" in stage}
+    assert [most for _, most in asked] == [size // 4 for size, _ in asked]
+    for name, large in (("indirect train", True), ("indirect test", False)):
+        assert (float(stages[name]["seconds_expected"]) >= 4900) == large, name
+
+
 def test_what_dominates_is_said_with_what_would_shorten_it() -> None:
     config = config_of(transport={"samples": 64, "test_samples": 2048})
     found = forecast(ddprt.load_scene("plates"), config)

@@ -144,7 +144,7 @@ def deep(columns: int, entries: int, depth: float) -> np.ndarray:
 
 
 BLOCKS = slow_unless(
-    [(4 * 1024 + 77, 1e-2, False), (4 * 1024 + 77, 1e-8, True), (900, 1e-2, True)],
+    [(4 * 1024 + 77, 1e-8, True), (900, 1e-2, True)],
     [5 * 1024, 4 * 1024 + 77, 900],
     [1e-2, 1e-8],
     [False, True],
