@@ -453,12 +453,13 @@ def test_labels_lie_apart_and_inside(found: Sweep, monkeypatch: pytest.MonkeyPat
     placed = fronts._placed
 
     def watched(axes: Any, cloud: Any, index: int, text: str, frame: Any, taken: list[Any]) -> bool:
+        before = len(taken)
         done = placed(axes, cloud, index, text, frame, taken)
         if done:
-            box = taken[-1]
+            box = taken[before]
             assert frame.x0 <= box.x0 < box.x1 <= frame.x1
             assert frame.y0 <= box.y0 < box.y1 <= frame.y1
-            assert not any(box.overlaps(other) for other in taken[:-1])
+            assert not any(box.overlaps(other) for other in taken[:before])
             boxes.append(box)
         return done
 

@@ -267,7 +267,7 @@ def _placed(axes: Any, cloud: Cloud, index: int, text: str, frame: Any, taken: l
         words = [other for other in taken if other.height > _LETTERS]
         free = not any(box.overlaps(other) for other in taken)
         if inside and free and not any(other.overlaps(bit) for bit in line for other in words):
-            taken += [*line, box]
+            taken += [box, *line]
             return True
         said.remove()
     return False
