@@ -1,226 +1,22 @@
 """The command line: `ddprt VERB FILE [--option value] [--section.key value]`.
 
-Exit 0 done, 2 the user can mend it (one line), 1 our fault, 130 interrupted and resumable. Imports stay inside the verbs,
-so that help is instant.
+Exit 0 done, 2 the user can mend it (one line), 1 our fault, 130 interrupted and resumable.
 """
 
 import os
 import shlex
 import sys
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from typing import Any, NoReturn
 
 from ddprt import __version__
 from ddprt.errors import UserError, nearest
 from ddprt.progress import Doubt
+from ddprt.verbs import LATER, VERBS, Call
 
 REPORT_ISSUE = "this is our fault: run again with --debug and report what it prints"
-
-
-@dataclass
-class Call:
-    """What was typed after the verb."""
-
-    verb: str
-    files: list[str] = field(default_factory=list)
-    options: dict[str, str] = field(default_factory=dict)
-    overrides: dict[str, str] = field(default_factory=dict)
-    command: str = ""
-
-    @property
-    def quiet(self) -> bool:
-        """Whether progress is hidden."""
-        return "quiet" in self.options
-
-    def asks(self, flag: str) -> bool:
-        """Whether a flag was given."""
-        return flag in self.options
-
-    def file(self, what: str) -> str:
-        """The one file argument."""
-        if len(self.files) != 1:
-            raise UserError(f"ddprt {self.verb}: got {len(self.files)} files, expected {what}; see `ddprt {self.verb} --help`")
-        return self.files[0]
-
-    def run(self) -> Any:
-        """The run folder and configuration that the arguments mean."""
-        from ddprt.config import load_config
-        from ddprt.pipeline import Run
-
-        source = self.file("a configuration such as configs/cornell.toml")
-        if _is_scene(source):
-            raise UserError(
-                f"ddprt {self.verb}: got the scene {source}, expected a configuration; "
-                f"write ddprt {self.verb} configs/cornell.toml --scene.name {source}"
-            )
-        config = load_config(source, self.overrides)
-        default = Path(source).parent if Path(source).name == "config.toml" else Path("runs") / Path(source).stem
-        return Run(config, Path(self.options.get("out") or default), command=self.command, quiet=self.quiet)
-
-
-def _is_scene(source: str) -> bool:
-    """Whether a scene stands where a configuration should."""
-    from ddprt.scene.files import SUFFIXES
-    from ddprt.scene.library import SCENES
-
-    return Path(source).suffix.lower() in SUFFIXES or (source in SCENES and not Path(source).is_file())
-
-
-def run(call: Call) -> None:
-    """bake, fit, evaluate, report and export"""
-    for what, path in call.run().all().items():
-        print(f"{what + ':':<10}{path}")
-
-
-def inspect(call: Call) -> None:
-    """what a scene is, what light it calls for, and what a bake would do"""
-    from ddprt.pipeline_inspect import describe
-
-    print(describe(call.file("a configuration, a scene name or a mesh"), call.overrides))
-
-
-def bake(call: Call) -> None:
-    """render the dataset of direct and indirect lightmaps"""
-    job = call.run()
-    data = job.bake()
-    job.record(data)
-    print(f"dataset:  {data.folder}")
-
-
-def fit(call: Call) -> None:
-    """learn a model from a baked dataset"""
-    job = call.run()
-    job.fit(job.dataset())
-    print(f"model:    {job.folder / 'model.ddprt'}")
-
-
-def evaluate(call: Call) -> None:
-    """score all methods on held-out lightings and write the report"""
-    job = call.run()
-    data = job.dataset()
-    models, seconds = job.fit(data)
-    report = job.report(data, models, job.evaluate(data, models, seconds))
-    print(f"metrics:  {job.folder / 'metrics.json'}\nreport:   {report}")
-
-
-def relight(call: Call) -> None:
-    """turn a lighting into an indirect lightmap: ddprt relight MODEL --lighting lights.json --out relit.exr"""
-    import json
-
-    from ddprt.lights import load_lightings, parse_lighting
-    from ddprt.methods.method import STATUSES
-    from ddprt.runtime.model_file import load_model
-    from ddprt.scene.exr import write_exr
-
-    source, out = call.options.get("lighting"), Path(call.options.get("out", "relit.exr"))
-    if source is None:
-        raise UserError(
-            'ddprt relight: got no --lighting, expected a JSON file or text such as [{"type": "point", ...}]; add it'
-        )
-    if out.suffix != ".exr":
-        raise UserError(f"--out: got {out}, expected a path that ends in .exr; name it so")
-    model = load_model(call.file("a model folder such as runs/cornell/model.ddprt"))
-    if source.lstrip().startswith(("[", "{")):
-        try:
-            records = json.loads(source)
-            several = isinstance(records, list) and bool(records) and isinstance(records[0], list)
-            lightings = [parse_lighting(entry, "--lighting") for entry in (records if several else [records])]
-        except (json.JSONDecodeError, RecursionError) as error:
-            raise UserError(
-                f'--lighting: got text that is not JSON ({error}), expected [{{"type": "point", ...}}] or the like; mend it'
-            ) from None
-    else:
-        lightings = load_lightings(source)
-    for index, lighting in enumerate(lightings):
-        path = out if len(lightings) == 1 else out.with_stem(f"{out.stem}_{index:03d}")
-        measured = model.measure(lighting)
-        image, trust = model.image(model.predict(measured)), model.trust(measured)
-        if not image.any():
-            print(
-                f"warning: lighting {index} lights no measurement point, so {path} is black; its lamps may stand "
-                "inside a solid, outside the scene, face away or have no intensity",
-                file=sys.stderr,
-            )
-        write_exr(path, image)
-        print(f"lightmap: {path}")
-        if trust is None or not measured.any():
-            continue
-        print(f"trust:    {trust.score:.2f}, an expected error of {1 - trust.score:.0%}")
-        if trust.extrapolating:
-            print(f"warning: lighting {index}: extrapolating: {STATUSES['extrapolating']}", file=sys.stderr)
-
-
-def export(call: Call) -> None:
-    """write basis textures, matrices and a manifest for engines"""
-    from ddprt.runtime.model_file import load_model
-
-    job = call.run()
-    job.export(load_model(job.folder / "model.ddprt"))
-    print(f"textures: {job.folder / 'export'}")
-
-
-def verify(call: Call) -> None:
-    """find damaged or missing files of a dataset"""
-    from ddprt.dataset.store import Manifest, expected_files, read_description
-
-    folder = Path(call.file("a dataset or a run folder"))
-    folder = folder / "dataset" if (folder / "dataset").is_dir() else folder
-    description, manifest = read_description(folder), Manifest(folder)
-    faults = manifest.damaged()
-    faults += [f"{name}: not baked yet" for name in expected_files(description) if name not in manifest.entries]
-    if faults:
-        for fault in faults:
-            print(fault)
-        raise UserError(
-            f"{folder}: got {len(faults)} faulty files of {len(expected_files(description))}; "
-            "delete the damaged ones and run the bake again to make them anew"
-        )
-    print(f"{folder}: {len(manifest.entries)} files whole")
-
-
-def doctor(call: Call) -> None:
-    """check that everything ddprt needs works on this machine"""
-    from ddprt.pipeline_inspect import checkup
-
-    lines, fine = checkup()
-    print(lines)
-    if not fine:
-        raise UserError("doctor: got parts that are missing or broken, expected all to work; mend what is marked above")
-
-
-@dataclass(frozen=True)
-class Verb:
-    """One verb: its code, what it works on, its own options and flags, and whether it takes --section.key overrides."""
-
-    work: Callable[[Call], None]
-    file: str = "FILE.toml"
-    options: dict[str, str] = field(default_factory=dict)
-    flags: dict[str, str] = field(default_factory=dict)
-    configured: bool = True
-
-
-_OUT = {"out": "DIR  folder of the run (default: runs/NAME)"}
-VERBS = {
-    "run": Verb(run, options=_OUT),
-    "inspect": Verb(inspect, "FILE.toml|SCENE|MESH"),
-    "bake": Verb(bake, options=_OUT),
-    "fit": Verb(fit, options=_OUT),
-    "eval": Verb(evaluate, options=_OUT),
-    "relight": Verb(
-        relight,
-        "MODEL",
-        {"lighting": "FILE|JSON  a list of lightings, or one as text", "out": "FILE.exr  where to (default: relit.exr)"},
-        configured=False,
-    ),
-    "export": Verb(export, options=_OUT),
-    "verify": Verb(verify, "DIR", configured=False),
-    "doctor": Verb(doctor, "", configured=False),
-}
-LATER = {"bench", "tune", "import", "view", "status"}
 FLAGS = {"quiet": "no progress", "debug": "tracebacks instead of one-line errors"}
 
 
@@ -293,8 +89,24 @@ def _dispatch(words: list[str]) -> int:
     if "-h" in rest or "--help" in rest:
         _help(name)
         return 0
-    VERBS[name].work(parse(name, rest))
+    call = parse(name, rest)
+    _keep_compiled()
+    VERBS[name].work(call)
     return 0
+
+
+def _keep_compiled() -> None:
+    """Lets JAX keep what it compiles for the next command, unless it is told elsewhere where to."""
+    if "jax" in sys.modules:  # it reads these when it is imported; within another program they are not ours to set
+        return
+    from ddprt.files import cache_folder
+    from ddprt.machine import instruction_set
+
+    folder = cache_folder() / f"jax-{instruction_set()}"
+    with suppress(OSError):  # a cache that cannot be written only costs time
+        folder.mkdir(parents=True, exist_ok=True)
+        os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder))
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
 
 def parse(name: str, words: list[str]) -> Call:

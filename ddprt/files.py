@@ -109,6 +109,12 @@ def written_whole(path: Path) -> Iterator[Path]:
             temporary.unlink()
 
 
+def cache_folder() -> Path:
+    """Where what only saves time is kept: `DDPRT_CACHE`, else ddprt in the user's cache; it may be deleted at any time."""
+    base = os.environ.get("DDPRT_CACHE") or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ddprt"
+    return Path(base)
+
+
 def make_folder(path: Path) -> None:
     """Creates a folder and its parents.
 
@@ -125,6 +131,28 @@ def write_text(path: Path, text: str) -> None:
     """Writes UTF-8 text whole."""
     with written_whole(path) as temporary:
         temporary.write_text(text, "utf-8")
+
+
+def append_line(path: Path, line: str) -> None:
+    """Adds a line to a file and sees it to the disk; what a killed process left of its own line stays a line apart.
+
+    Raises:
+      UserError: the file cannot be written.
+    """
+    try:
+        with path.open("a+b") as file:
+            end = file.seek(0, os.SEEK_END)
+            whole = end == 0
+            if end:
+                file.seek(end - 1)
+                whole = file.read(1) == b"\n"
+            file.write((("" if whole else "\n") + line + "\n").encode())
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise UserError(
+            f"{path}: cannot be written ({error.strerror or error}); free some space or mend its permissions"
+        ) from None
 
 
 def write_tensors(path: Path, tensors: dict[str, np.ndarray]) -> None:

@@ -1,7 +1,9 @@
 """What a run ran on: recorded beside every measured second."""
 
+import hashlib
 import os
 import platform
+import subprocess
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -23,12 +25,34 @@ def machine() -> dict[str, Any]:
     }
 
 
+def instruction_set() -> str:
+    """What code compiled here may ask of a processor, as eight digits: elsewhere it might not run."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        kinds = sorted({line for line in lines if line.startswith(("flags", "Features", "model name"))})
+    except OSError:
+        kinds = [platform.processor()]
+    return hashlib.sha256("\n".join([platform.machine(), *kinds]).encode()).hexdigest()[:8]
+
+
 def installed(package: str) -> str | None:
     """Version of an installed package, None where it is missing."""
     try:
         return version(package)
     except PackageNotFoundError:
         return None
+
+
+def commit() -> str | None:
+    """Short hash of the checkout that this code runs from, "+" where files differ from it; None where it is no checkout."""
+    root = Path(__file__).parent.parent
+    if not (root / ".git").exists():
+        return None
+    try:
+        found = subprocess.run(["git", "-C", str(root), "describe", "--always", "--dirty=+"], capture_output=True, text=True)
+    except OSError:  # no git
+        return None
+    return found.stdout.strip() or None
 
 
 def peak_memory_gib() -> float | None:

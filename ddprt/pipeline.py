@@ -11,6 +11,7 @@ import numpy as np
 
 from ddprt import __version__
 from ddprt.config import Config
+from ddprt.dataset.forecast import Forecast, forecast
 from ddprt.dataset.generate import bake, other_settings
 from ddprt.dataset.store import Dataset, open_dataset
 from ddprt.errors import UserError
@@ -58,11 +59,26 @@ class Run:
         check_names(self.config)
         scene = self.scene
         make_folder(self.folder)
-        data = bake(scene, config=self.config, out=self.folder / "dataset", progress=self.progress)
+        if self.config.lightings.target_error:
+            from ddprt.pipeline_active import bake_to_target
+
+            data = bake_to_target(scene, self.config, self.folder / "dataset", self.progress)
+        else:
+            data = bake(scene, config=self.config, out=self.folder / "dataset", progress=self.progress)
         write_text(self.folder / "config.toml", self.config.to_toml())
         if not any(stage.get("rays") for stage in self.progress.stages):
             self._remember_bake()
         return data
+
+    def forecast(self) -> Forecast:
+        """What `bake` would take from nothing; samples of files are written beside the folder of the run, and removed."""
+        begun = time.perf_counter()
+        from ddprt.methods.names import check_names  # takes its time, as it will when the bake begins
+
+        check_names(self.config)
+        scene, loading = self.scene, time.perf_counter() - begun
+        beside = next(path for path in self.folder.absolute().parents if path.is_dir())
+        return forecast(scene, self.config, self.progress, beside=beside, loading=loading)
 
     def _remember_bake(self) -> None:
         """Takes the stages of the bake from an earlier run.json where this run found everything baked."""
@@ -146,8 +162,20 @@ class Run:
         write_text(self.folder / "metrics.json", json.dumps(evaluation.metrics, indent=1, allow_nan=False) + "\n")
         return evaluation
 
-    def report(self, data: Dataset, models: dict[str, Any], evaluation: Any) -> Path:
-        """Writes report.html."""
+    def budget(self, data: Dataset, models: dict[str, Any]) -> dict[str, Any]:
+        """Takes the error of the main model apart, and writes budget.json; its bakes stay in the folder `budget`."""
+        from ddprt.bench.advice import record
+        from ddprt.bench.budget import measure_budget
+        from ddprt.bench.yardsticks import Bakery
+
+        bakery = Bakery(self.scene, self.config, data, self.folder / "budget", self.progress)
+        model = next(iter(models.values()))
+        document = record(measure_budget(model, bakery), model, bakery)
+        write_text(self.folder / "budget.json", json.dumps(document, indent=1, allow_nan=False) + "\n")
+        return document
+
+    def report(self, data: Dataset, models: dict[str, Any], evaluation: Any, *, budget: dict[str, Any] | None = None) -> Path:
+        """Writes report.html; `budget` is what `Run.budget` gave."""
         from ddprt.report.page import write_page
 
         path = self.folder / "report.html"
@@ -163,6 +191,7 @@ class Run:
                 plan_effects=self.effects(data).effects,
                 effect_costs={str(row["name"]): row for row in self.costs(data)},
                 command=self.command,
+                budget=budget,
             )
         return path
 
@@ -176,6 +205,18 @@ class Run:
         if self.config.export.stitch and not seams["stitched"]:
             self.progress.warn(f"export.stitch: seams stay open: {seams['why']}")
         return files
+
+    def sweep(self) -> list[Path]:
+        """Tries settings about the configuration (`ddprt bench`); returns the results and what shows them."""
+        from ddprt.bench.frontier import sweep
+
+        return sweep(self.config, self.folder / "bench", self.progress)
+
+    def tune(self) -> Any:
+        """Searches a setting within the limits of [tune]; see `ddprt.bench.tune.Outcome`."""
+        from ddprt.bench.tune import tune
+
+        return tune(self.config, self.folder / "tune", self.progress)
 
     def effects(self, data: Dataset) -> Plan:
         """The plan that the dataset was baked under."""

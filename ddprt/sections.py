@@ -214,6 +214,9 @@ class BudgetConfig(Section):
 
     lightings: int = Field(64, ge=4, description="held-out lightings that the error is taken apart on")
     noise: float = Field(0.004, ge=1e-4, le=1.0, description="relative RMSE of maps that count as free of noise")
+    truth_samples: Literal["auto"] | Annotated[int, Field(ge=2, le=131072)] = Field(
+        "auto", description="unbiased paths per texel of the truth, in two halves; auto: as noise asks"
+    )
     abundance: int = Field(4, ge=1, le=64, description="so many times the training lightings count as all there are")
     scenario: dict[str, Any] = Field(
         {}, description="settings of [lightings] that the held-out ones differ in, e.g. {kinds = ['spot']}"

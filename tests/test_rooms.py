@@ -23,8 +23,10 @@ WALK = [
     "report",
     "export",
     "bench",
+    "pipeline_active",
     "pipeline",
     "pipeline_inspect",
+    "verbs",
     "cli",
 ]
 FILES = sorted(PACKAGE.rglob("*.py"))
@@ -79,6 +81,7 @@ def test_each_heavy_library_has_its_door() -> None:
     assert doors("xatlas") == {"scene/unwrap.py"}
     assert doors("pyoidn") == {"dataset/denoise.py"}
     assert doors("numba") == {"compiled.py"}
+    assert doors("flip_evaluator") == {"report/perceived.py"}
     assert doors("optax") == {"methods/mlp.py"}
     assert {Path(name).parts[0] for name in doors("matplotlib")} == {"report"}
 

@@ -37,6 +37,10 @@ class Timing:
     compile: float
     repeats: int
 
+    def each(self, count: int) -> "Timing":
+        """Seconds of one of `count` calls that a run was made of."""
+        return Timing(self.median / count, self.low / count, self.high / count, self.compile, self.repeats)
+
     def record(self) -> dict[str, float]:
         """As plain numbers to five digits."""
         return {name: float(f"{value:.5g}") for name, value in asdict(self).items()}

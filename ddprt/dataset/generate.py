@@ -19,7 +19,7 @@ from ddprt.dataset import store
 from ddprt.dataset.denoise import find_denoiser
 from ddprt.dataset.indirect import IndirectBake
 from ddprt.dataset.scratch import remove_left
-from ddprt.dataset.splits import SPLITS, Splits, choose_lightings, doubt, grouped
+from ddprt.dataset.splits import SPLITS, Splits, check_choice, choose_lightings, chosen, doubt, grouped
 from ddprt.dataset.store import Dataset, Manifest, map_name
 from ddprt.errors import UserError
 from ddprt.files import alone_in, write_tensors
@@ -43,13 +43,14 @@ _SAID = {"placing": "points", "counts": "lightings"}  # what dataset.json calls 
 
 def bake(
     scene: Scene,
-    lightings: Sequence[Lighting] | Splits | None = None,
+    lightings: Sequence[Lighting] | Splits | str | None = None,
     *,
     resolution: int | None = None,
     samples: int | Literal["auto"] | None = None,
     seed: int | None = None,
     config: Config | None = None,
     out: str | Path | None = None,
+    first: int | None = None,
     progress: Progress | None = None,
 ) -> Dataset:
     """Renders pairs of direct and indirect lightmaps.
@@ -57,7 +58,8 @@ def bake(
     Args:
       scene: from `ddprt.load_scene`.
       lightings: a mapping of "train", "validation" and "test" to lightings; or one list, of which the last fifth becomes test
-        and the tenth before it validation; or None to draw them as the configuration says.
+        and the tenth before it validation; or None to draw them as the configuration says; or "active" to draw them so and
+        choose those of training by what they tell (`lightings.choose`).
       resolution: texels per side of the lightmap; 256 unless given.
       samples: gather rays per texel (twice as many for held-out lightings); "auto", the default, as many as
         `config.transport.target_noise` asks for.
@@ -65,6 +67,7 @@ def bake(
       config: all settings at once, in place of `resolution`, `samples` and `seed`.
       out: folder; an unfinished bake of the same settings there goes on. None bakes into a temporary folder that lives as
         long as the dataset.
+      first: of the training lightings that are chosen, bake only so many, the most telling; None bakes all.
       progress: shown if given.
     Returns:
       The finished dataset.
@@ -86,9 +89,14 @@ def bake(
         config = checked({"seed": given.get("seed", 0), "atlas": atlas, "transport": transport})
     elif given:
         raise UserError(f"bake: got {' and '.join(given)} beside a config, expected one or the other; set it in the config")
+    if isinstance(lightings, str):
+        if lightings != "active":
+            raise UserError(f'bake: got lightings "{lightings}", expected a list, splits, "active" or none')
+        asked = config.lightings.model_copy(update={"choose": "active"})
+        config, lightings = config.model_copy(update={"lightings": asked}), None
     keep_alive = tempfile.TemporaryDirectory(prefix="ddprt-") if out is None else None
     folder = Path(keep_alive.name if keep_alive else str(out))
-    return _Bake(scene, config, folder, progress or Progress(quiet=True)).run(lightings, keep_alive)
+    return _Bake(scene, config, folder, progress or Progress(quiet=True), first).run(lightings, keep_alive)
 
 
 def baked_settings(config: Config, scene: Scene) -> dict[str, Any]:
@@ -108,6 +116,9 @@ def other_settings(description: dict[str, Any], config: Config, scene: Scene) ->
     wanted: dict[str, Any] = baked_settings(config, scene)
     if not config.lightings.file:
         wanted["counts"] = {name: getattr(config.lightings, name) for name in SPLITS}
+        baked = _counts(description.get("lightings", []))["train"]
+        if config.lightings.target_error and 0 < baked < config.lightings.train:  # it was reached by so many
+            wanted["counts"]["train"] = baked
     return differences(description, wanted)
 
 
@@ -166,13 +177,14 @@ def _records(entries: Sequence[tuple[str, Lighting]]) -> list[dict[str, Any]]:
 class _Bake:
     """One bake from start to end; every stage skips what the manifest already holds."""
 
-    def __init__(self, scene: Scene, config: Config, folder: Path, progress: Progress) -> None:
-        self.scene, self.config, self.folder, self.progress = scene, config, folder, progress
+    def __init__(self, scene: Scene, config: Config, folder: Path, progress: Progress, first: int | None) -> None:
+        self.scene, self.config, self.folder, self.progress, self.first = scene, config, folder, progress, first
         self.tracer = Tracer.of(scene, config.transport.threads)
 
     def run(self, given: Sequence[Lighting] | Splits | None, keep_alive: Any) -> Dataset:
         if self.config.transport.denoise:
             find_denoiser()
+        check_choice(self.config, self.first)
         with alone_in(self.folder):
             return self._alone(given, keep_alive)
 
@@ -187,14 +199,10 @@ class _Bake:
             stage.facts |= {"lightings": len(entries), **drawn}
         lightings = [lighting for _, lighting in entries]
         listed = listed and self._sunk(listed, lightings)
-        if there is not None:
+        active = self.config.lightings.choose == "active"
+        if there is not None and not active:
             points = {"points": self._points(listed)} if listed else {}
             self._refuse_other(there, {"counts": _counts(_records(entries)), "lightings": _records(entries), **points})
-        effects = plan(self.scene, lightings, bounces=self.config.transport.bounces)
-        if self.config.transport.integrator in ("paths", "reference"):  # the operator tells what it left out, if anything
-            for effect in effects.effects:
-                if effect.bound is None and not effect.forced:
-                    self.progress.warn(f"{effect.name}: {effect.why}")
         with self.progress.stage("atlas") as stage:
             settings = self.config.atlas
             atlas, hidden = build_open_atlas(self.tracer, self.scene, settings.resolution, settings.padding)
@@ -202,6 +210,16 @@ class _Bake:
         with self.progress.stage("points") as stage:
             samples = listed or self._sunk(self._placed(atlas), lightings)
             stage.facts |= {"samples": len(samples.position), "depth": round(samples.depth, 6)}
+        if active or self.config.points.choose == "qr":
+            with self.progress.stage("choose") as stage:
+                entries, samples, shadow_rays = chosen(entries, samples, self.config, self.tracer, self.first)
+                stage.facts |= {"train": sum(split == "train" for split, _ in entries), "shadow_rays": shadow_rays}
+            lightings = [lighting for _, lighting in entries]
+        effects = plan(self.scene, lightings, bounces=self.config.transport.bounces)
+        if self.config.transport.integrator in ("paths", "reference"):  # the operator tells what it left out, if anything
+            for effect in effects.effects:
+                if effect.bound is None and not effect.forced:
+                    self.progress.warn(f"{effect.name}: {effect.why}")
         description = self._description(entries, effects, drawn, samples)
         if there is None:
             (self.folder / "manifest.jsonl").unlink(missing_ok=True)  # it tells of a dataset that nobody knows any more

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from ddprt.axes import Bool, Float32, Float64
+from ddprt.dataset.pack import Pack, Shelf, Stored, remove_packs
 from ddprt.errors import UserError
 from ddprt.files import make_folder, read_tensors, sha256, write_text
 from ddprt.lights import Lighting, parse_lighting
@@ -103,15 +104,47 @@ class Dataset:
 
     def maps(self, kind: str, indices: Sequence[int]) -> Float32[np.ndarray, "lightings texels 3"]:
         """Lightmaps of the covered texels in W/m²; kind is "direct", "indirect" or (held-out lightings) "noise"."""
+        if kind == "indirect":
+            pack = self._shelf.find([map_name(kind, index) for index in indices])
+            if isinstance(pack, Pack):
+                return pack.read(indices)
         values = np.empty((len(indices), int(self.covered.sum()), 3), np.float32)
         for row, index in enumerate(indices):
             path = self.folder / map_name(kind, index)
-            image = read_map(path)
-            if image.shape != (*self.covered.shape, 3):
-                raise UserError(f"{path}: got a map of shape {image.shape}, expected {(*self.covered.shape, 3)}; bake it again")
-            values[row] = image[self.covered]
+            values[row] = _light(*self._stored(path))[self.covered]
             _refuse_odd(path, values[row], signed=kind == "noise")
         return values
+
+    def packed(self) -> Pack | None:
+        """The indirect maps as one file, which is made where it is missing or older than they are.
+
+        Returns:
+          None where it cannot be made, which is said once, as a `Doubt`; `maps` then reads the maps one by one.
+        Raises:
+          UserError: a map that cannot be read, or holds what is no light.
+        """
+
+        def read(name: str) -> Stored:
+            image, exposure = self._stored(self.folder / name)
+            _refuse_odd(self.folder / name, _light(image, exposure)[self.covered])
+            return image, exposure
+
+        return self._shelf.fill([map_name("indirect", i) for i in range(len(self.lightings))], self.covered, read)
+
+    @cached_property
+    def _shelf(self) -> Shelf:
+        def sources() -> dict[str, dict[str, Any]]:
+            names = ["atlas/coverage.exr", *(map_name("indirect", i) for i in range(len(self.lightings)))]
+            entries = Manifest(self.folder).entries
+            return {name: entries[name] for name in names} if all(name in entries for name in names) else {}
+
+        return Shelf(self.folder, "indirect", sources)
+
+    def _stored(self, path: Path) -> Stored:
+        image, exposure = _read_stored(path)
+        if image.shape != (*self.covered.shape, 3):
+            raise UserError(f"{path}: got a map of shape {image.shape}, expected {(*self.covered.shape, 3)}; bake it again")
+        return image, exposure
 
     def measured(self, indices: Sequence[int]) -> Float32[np.ndarray, "lightings samples 3"]:
         """Direct irradiance at all samples, W/m²."""
@@ -279,14 +312,25 @@ def read_map(path: Path) -> Float32[np.ndarray, "height width 3"]:
     Raises:
       UserError: missing or damaged.
     """
+    return _light(*_read_stored(path))
+
+
+def _read_stored(path: Path) -> Stored:
     image, attributes = read_exr(path)
     try:
-        with np.errstate(over="ignore"):  # what becomes infinite is refused where light is read
-            return np.ldexp(image, int(attributes.get("ddprt_exposure", "0")))
+        exposure = int(attributes.get("ddprt_exposure", "0"))
+        np.ldexp(np.float32(1), exposure)
     except (ValueError, OverflowError):
         raise UserError(
             f"{path}: got exposure {attributes['ddprt_exposure']!r}, expected a whole number; bake it again"
         ) from None
+    return image, exposure
+
+
+def _light(stored: Float32[np.ndarray, "*places"], exposure: int) -> Float32[np.ndarray, "*places"]:
+    """Stored values in W/m²."""
+    with np.errstate(over="ignore"):  # what becomes infinite is refused where light is read
+        return np.ldexp(stored, exposure)
 
 
 def write_atlas(folder: Path, atlas: Atlas, manifest: Manifest) -> None:
@@ -305,7 +349,8 @@ def write_description(folder: Path, description: dict[str, Any]) -> None:
 
 
 def discard(folder: Path) -> None:
-    """Removes what a bake wrote into a folder; what else lies there stays."""
+    """Removes what a bake wrote into a folder, and the packs made of it; what else lies there stays."""
+    remove_packs(folder)
     names = list(Manifest(folder).entries)
     for name in (*names, "manifest.jsonl", "dataset.json"):
         (folder / name).unlink(missing_ok=True)

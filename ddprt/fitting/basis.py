@@ -7,10 +7,10 @@ projected on the deep left vectors, is as accurate relative to the largest deep 
 rather than rounding (`RANK_CUT`); docs/stability.md has the table that this choice was made from.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -18,10 +18,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 _TILE = 1 << 10  # entries turned to float64 at once: 256 columns of them fit a core's second cache
+_BLOCK = 1 << 25  # bytes of columns that are cut out, or come from disk, at once
 RANK_CUT = 1e-7
 """Singular values below this share of the largest are rounding of the float32 data, not light."""
 
-
+# A Gram matrix as the products of its rows' upper and lower half: A A^T, A B^T and B B^T, a quarter less work than the whole.
+_Gram = tuple[Array, Array, Array]
 Status = Literal["ok", "rank_deficient", "no_signal"]
 
 
@@ -48,10 +50,33 @@ class Basis:
     status: Status
 
 
+@runtime_checkable
+class Columns(Protocol):
+    """Columns that need not lie in memory: they come in blocks of entries, whole tiles all but the last, in order."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Columns and entries."""
+        ...
+
+    def blocks(self) -> Iterator[Float[Array, "columns block"]]:
+        """All entries, from the first on, as often as it is asked for."""
+        ...
+
+
+def block_entries(columns: int) -> int:
+    """Entries of so many columns that go well in one block: whole tiles, 32 MiB or one tile."""
+    return max(1, _BLOCK // (4 * max(columns, 1)) // _TILE) * _TILE
+
+
 def fit_basis(
-    columns: Float[Array, "columns entries"], weights: Float[Array, " entries"], *, bases: int, centre: bool = False
+    columns: Float[Array, "columns entries"] | Columns, weights: Float[Array, " entries"], *, bases: int, centre: bool = False
 ) -> Basis:
     """The best `bases`-dimensional space for the columns, in the weighted least-squares sense.
+
+    The data is walked through in blocks, two times, three with `centre` and once more where the spectrum is deep. Beside a few
+    blocks and the matrices of columns by columns, only the vectors are held, once in float64. How the entries are cut into
+    blocks changes nothing: the tiles that sums run over are the same.
 
     Args:
       columns: one observation per row: scaled, encoded indirect light of a lighting (and channel).
@@ -62,11 +87,12 @@ def fit_basis(
       ValueError: columns or weights are not finite, or a weight is negative.
     Reference: Belcour et al., HPG 2022, Eq. 7 and 8; Turk and Pentland 1991 for the small matrix.
     """
-    if len(columns) == 0 or bases == 0:
-        empty = jnp.zeros((0, columns.shape[1]), jnp.float32)
-        return Basis(empty, jnp.zeros(columns.shape[1]), jnp.zeros((len(columns), 0)), jnp.zeros(len(columns)), 0, "no_signal")
+    count, entries = columns.shape
+    if count == 0 or bases == 0:
+        empty = jnp.zeros((0, entries), jnp.float32)
+        return Basis(empty, jnp.zeros(entries), jnp.zeros((count, 0)), jnp.zeros(count), 0, "no_signal")
     with jax.enable_x64(True):
-        mean = jnp.mean(columns, 0, dtype=jnp.float64) if centre else None
+        mean = _mean(columns) if centre else None
         sigma, rotation = _decompose(columns, weights, mean)
         if not np.isfinite(np.asarray(sigma)).all():
             raise ValueError("got NaN, infinity or a negative weight, expected finite columns and weights of 0 or more")
@@ -75,7 +101,7 @@ def fit_basis(
         rank = int(np.sum(np.asarray(sigma) > RANK_CUT * float(sigma[0])))
         kept = min(bases, rank)
         vectors, coefficients = _build(columns, weights, mean, sigma[:kept], rotation[:, :kept])
-        shown = jnp.zeros(columns.shape[1], jnp.float32) if mean is None else mean.astype(jnp.float32)
+        shown = jnp.zeros(entries, jnp.float32) if mean is None else mean.astype(jnp.float32)
         dark = rank == 0 and not np.asarray(shown).any()
         status: Status = "no_signal" if dark else "rank_deficient" if kept < bases else "ok"
         return Basis(vectors, shown, coefficients, sigma, rank, status)
@@ -97,41 +123,85 @@ def _deep(sigma: np.ndarray) -> tuple[int, int] | None:
     return max(0, last - -(-(last - first) // step) * step), last
 
 
-@jax.jit
-def _decompose(columns: Array, weights: Array, mean: Array | None) -> tuple[Array, Array]:
+def _decompose(columns: Array | Columns, weights: Array, mean: Array | None) -> tuple[Array, Array]:
     """Singular values and left singular vectors of the weighted data, falling, in float64."""
+    return _eigen(_over_blocks(_squared, _no_square(columns.shape[0]), columns, weights, mean))
 
+
+@jax.jit
+def _squared(gram: _Gram, columns: Array, weights: Array, mean: Array | None) -> _Gram:
     def add(gram: _Gram, start: Array | int, columns: Array, weights: Array, mean: Array | None) -> _Gram:
         return _add_square(gram, _centred(columns, mean) * jnp.sqrt(weights.astype(jnp.float64)))
 
-    return _eigen(_over_tiles(add, _no_square(len(columns)), columns, weights, mean))
+    return _over_tiles(add, gram, columns, weights, mean)
 
 
-@partial(jax.jit, static_argnames=("first", "last"))
 def _sharpen(
-    columns: Array, weights: Array, mean: Array | None, sigma: Array, rotation: Array, first: int, last: int
+    columns: Array | Columns, weights: Array, mean: Array | None, sigma: Array, rotation: Array, first: int, last: int
 ) -> tuple[Array, Array]:
     """Singular values and left vectors, those from `first` to `last` taken from the data projected on them alone."""
-    deep = rotation[:, first:last].T
+    step = partial(_squared_part, first, last, rotation)
+    gram = _over_blocks(step, _no_square(last - first), columns, weights, mean)
+    return _in_order(first, sigma, rotation, *_eigen(gram))
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _squared_part(
+    first: int, last: int, rotation: Array, gram: _Gram, columns: Array, weights: Array, mean: Array | None
+) -> _Gram:
+    deep = jax.lax.optimization_barrier(rotation[:, first:last].T)
 
     def add(gram: _Gram, start: Array | int, columns: Array, weights: Array, mean: Array | None) -> _Gram:
         part = jnp.matmul(deep, _centred(columns, mean), precision="highest")
         return _add_square(gram, part * jnp.sqrt(weights.astype(jnp.float64)))
 
-    values, turn = _eigen(_over_tiles(add, _no_square(last - first), columns, weights, mean))
+    return _over_tiles(add, gram, columns, weights, mean)
+
+
+@partial(jax.jit, static_argnums=0)
+def _in_order(first: int, sigma: Array, rotation: Array, values: Array, turn: Array) -> tuple[Array, Array]:
+    """The deep values and vectors in their places, all falling."""
+    last = first + len(values)
     sigma = sigma.at[first:last].set(values)
-    rotation = rotation.at[:, first:last].set(jnp.matmul(deep.T, turn, precision="highest"))
+    rotation = rotation.at[:, first:last].set(jnp.matmul(rotation[:, first:last], turn, precision="highest"))
     order = jnp.argsort(-sigma)
     return sigma[order], rotation[:, order]
 
 
-@jax.jit
-def _build(columns: Array, weights: Array, mean: Array | None, sigma: Array, rotation: Array) -> tuple[Array, Array]:
+def _build(columns: Array | Columns, weights: Array, mean: Array | None, sigma: Array, rotation: Array) -> tuple[Array, Array]:
     """Orthonormal vectors (float32) and the columns' coefficients (float64)."""
-    bases, entries = len(sigma), columns.shape[1]
+    bases, (count, entries) = len(sigma), columns.shape
     if bases == 0:
-        return jnp.zeros((0, entries), jnp.float32), jnp.zeros((len(columns), 0), jnp.float64)
-    turn = (rotation / sigma).T
+        return jnp.zeros((0, entries), jnp.float32), jnp.zeros((count, 0), jnp.float64)
+    parts: list[Array] = []
+
+    def step(overlap: Array, *block: Any) -> Array:
+        part, overlap = _projected(overlap, sigma, rotation, *block)
+        parts.append(part)
+        return overlap
+
+    overlap = _over_blocks(step, jnp.zeros((bases, bases), jnp.float64), columns, weights, mean)
+    # One Cholesky step removes what rounding left of the overlap; then the sign rule.
+    L, straight = _upright(overlap)
+    vectors, start = np.empty((bases, entries), np.float32), 0
+    ends = np.full((2, bases), -np.inf)  # the largest entries of the vectors and of their negatives
+    parts.reverse()
+    while parts:  # one goes as the other comes
+        part, top, bottom = _straightened(straight, parts.pop())
+        vectors[:, start : start + part.shape[1]] = part
+        start, ends = start + part.shape[1], np.maximum(ends, [top, bottom])
+    sign = np.where(ends[0] < ends[1], -1.0, 1.0)
+    vectors *= sign[:, None].astype(np.float32)
+    # X = V S Y and Y = L U: the coefficients X W U^T need no further product with the data.
+    return jnp.asarray(vectors), _weighed(rotation, sigma, L, sign)
+
+
+@jax.jit
+def _projected(
+    overlap: Array, sigma: Array, rotation: Array, columns: Array, weights: Array, mean: Array | None
+) -> tuple[Array, Array]:
+    """Vectors of a block, nearly orthonormal, and the overlap with what the block adds to it."""
+    turn = jax.lax.optimization_barrier((rotation / sigma).T)  # its layout must not hang on how many tiles there are
 
     def add(
         total: tuple[Array, Array], start: Array | int, columns: Array, weights: Array, mean: Array | None
@@ -141,24 +211,33 @@ def _build(columns: Array, weights: Array, mean: Array | None, sigma: Array, rot
         overlap = overlap + jnp.matmul(part * weights, part.T, precision="highest")
         return jax.lax.dynamic_update_slice_in_dim(vectors, part, start, -1), overlap
 
-    empty = jnp.zeros((bases, entries), jnp.float64), jnp.zeros((bases, bases), jnp.float64)
-    vectors, overlap = _over_tiles(add, empty, columns, weights, mean)
-    # One Cholesky step removes what rounding left of the overlap; then the sign rule.
+    return _over_tiles(add, (jnp.zeros((len(turn), columns.shape[1]), jnp.float64), overlap), columns, weights, mean)
+
+
+@jax.jit
+def _upright(overlap: Array) -> tuple[Array, Array]:
     L = jnp.linalg.cholesky(overlap)
-    straight = jax.scipy.linalg.solve_triangular(L, jnp.eye(bases), lower=True)
-    vectors = jnp.matmul(straight, vectors, precision="highest")
-    sign = jnp.where(jnp.max(vectors, 1) < -jnp.min(vectors, 1), -1, 1)
-    # X = V S Y and Y = L U: the coefficients X W U^T need no further product with the data.
-    coefficients = jnp.matmul(rotation * sigma, L, precision="highest") * sign
-    return (vectors * sign[:, None]).astype(jnp.float32), coefficients
+    return L, jax.scipy.linalg.solve_triangular(L, jnp.eye(len(L)), lower=True)
+
+
+@jax.jit
+def _straightened(straight: Array, part: Array) -> tuple[Array, Array, Array]:
+    vectors = jnp.matmul(straight, part, precision="highest")
+    return vectors.astype(jnp.float32), jnp.max(vectors, 1), -jnp.min(vectors, 1)
+
+
+@jax.jit
+def _weighed(rotation: Array, sigma: Array, L: Array, sign: Array) -> Array:
+    return jnp.matmul(rotation * sigma, L, precision="highest") * sign
+
+
+def _mean(columns: Array | Columns) -> Array:
+    parts = [jax.block_until_ready(jnp.mean(block, 0, dtype=jnp.float64)) for block in _blocks(columns)]
+    return parts[0] if len(parts) == 1 else jnp.concatenate(parts)
 
 
 def _centred(columns: Array, mean: Array | None) -> Array:
     return columns.astype(jnp.float64) if mean is None else columns - mean
-
-
-# A Gram matrix as the products of its rows' upper and lower half: A A^T, A B^T and B B^T, a quarter less work than the whole.
-_Gram = tuple[Array, Array, Array]
 
 
 def _no_square(n: int) -> _Gram:
@@ -173,11 +252,40 @@ def _add_square(gram: _Gram, rows: Array) -> _Gram:
     return aa, ab, bb
 
 
+@jax.jit
 def _eigen(gram: _Gram) -> tuple[Array, Array]:
     """Roots of the eigenvalues, falling, and eigenvectors."""
     aa, ab, bb = gram
     squares, vectors = jnp.linalg.eigh(jnp.block([[aa, ab], [ab.T, bb]]))
     return jnp.sqrt(jnp.maximum(squares[::-1], 0)), vectors[:, ::-1]
+
+
+def _over_blocks(step: Callable[..., Any], total: Any, columns: Array | Columns, weights: Array, mean: Array | None) -> Any:
+    """Folds `step` over blocks of entries: what comes from disk and what lies in memory take the same way.
+
+    Waits for each block, so that there is never more than one at work and one on its way.
+    """
+    start = 0
+    for block in _blocks(columns):
+        size = block.shape[1]
+        total = jax.block_until_ready(step(total, block, *(_cut(array, start, size) for array in (weights, mean))))
+        start += size
+    return total
+
+
+def _blocks(columns: Array | Columns) -> Iterator[Array]:
+    if isinstance(columns, Columns):
+        yield from columns.blocks()
+        return
+    size, entries = block_entries(len(columns)), columns.shape[1]
+    for start in range(0, entries, size):
+        yield _cut(columns, start, min(size, entries - start))
+
+
+def _cut(array: Array | None, start: int, size: int) -> Array | None:
+    if array is None or size == array.shape[-1]:
+        return array
+    return jax.lax.dynamic_slice_in_dim(array, start, size, -1)
 
 
 def _over_tiles(add: Callable[..., Any], total: Any, *arrays: Array | None) -> Any:
@@ -189,7 +297,9 @@ def _over_tiles(add: Callable[..., Any], total: Any, *arrays: Array | None) -> A
         tile = jax.tree.map(lambda array: jax.lax.dynamic_slice_in_dim(array, i * _TILE, _TILE, -1), arrays)
         return add(total, i * _TILE, *tile)
 
-    total = jax.lax.fori_loop(0, whole // _TILE, step, total) if whole else total
+    # A loop of one round would be taken apart and its last bits would be others: they must not tell how many tiles a block has.
+    rounds = jax.lax.optimization_barrier(jnp.asarray(1)) if whole == _TILE else whole // _TILE
+    total = jax.lax.fori_loop(0, rounds, step, total) if whole else total
     return add(total, whole, *jax.tree.map(lambda array: array[..., whole:], arrays)) if entries > whole else total
 
 

@@ -49,6 +49,11 @@ class RectLight(LightModel):
         """See `Light`."""
         return np.array(self.center)
 
+    def reach(self) -> float:
+        """See `Light`."""
+        corners = np.add(self.half_u, self.half_v), np.subtract(self.half_u, self.half_v)
+        return float(np.linalg.norm(corners, axis=1).max())
+
     def scaled(self, factor: float) -> "RectLight":
         """See `Light`."""
         return self.model_copy(update={"radiance": brightened(self.radiance, factor)})
@@ -84,6 +89,10 @@ class SphereLight(LightModel):
     def anchor(self) -> Float[np.ndarray, "3"] | None:
         """See `Light`."""
         return np.array(self.center)
+
+    def reach(self) -> float:
+        """See `Light`."""
+        return self.radius
 
     def scaled(self, factor: float) -> "SphereLight":
         """See `Light`."""

@@ -34,6 +34,10 @@ class DirectionalLight(LightModel):
         """See `Light`."""
         return None
 
+    def reach(self) -> float:
+        """See `Light`."""
+        return 0.0
+
     def scaled(self, factor: float) -> "DirectionalLight":
         """See `Light`."""
         return self.model_copy(update={"irradiance": brightened(self.irradiance, factor)})

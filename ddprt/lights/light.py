@@ -104,6 +104,10 @@ class Light(Protocol):
         """Where the light stands, to tell whether that is inside a solid; None for distant lights."""
         ...
 
+    def reach(self) -> float:
+        """Metres from there to its farthest part: 0 for lights without size."""
+        ...
+
     def scaled(self, factor: float) -> "Light":
         """The same light, `factor` times as strong."""
         ...

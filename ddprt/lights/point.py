@@ -36,6 +36,10 @@ class PointLight(LightModel):
         """See `Light`."""
         return np.array(self.position)
 
+    def reach(self) -> float:
+        """See `Light`."""
+        return 0.0
+
     def scaled(self, factor: float) -> "PointLight":
         """See `Light`."""
         return self.model_copy(update={"intensity": brightened(self.intensity, factor)})
@@ -77,6 +81,10 @@ class SpotLight(LightModel):
     def anchor(self) -> Float[np.ndarray, "3"] | None:
         """See `Light`."""
         return np.array(self.position)
+
+    def reach(self) -> float:
+        """See `Light`."""
+        return 0.0
 
     def scaled(self, factor: float) -> "SpotLight":
         """See `Light`."""

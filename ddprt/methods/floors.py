@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ddprt.methods.method import Examples, FitReport, Frame, Method, array_bytes, as_pytree, found_in
+from ddprt.methods.method import Examples, FitReport, Frame, Method, array_bytes, as_pytree, found_in, in_memory
 
 
 @as_pytree
@@ -88,4 +88,4 @@ class NearestLighting(Method):
 
     def fit(self, train: Examples, validation: Examples, *, key: Array) -> NearestMaps:
         """See `Method`."""
-        return NearestMaps(train.frame.values, train.indirect, FitReport().noting(*found_in(train)))
+        return NearestMaps(train.frame.values, in_memory(train.indirect), FitReport().noting(*found_in(train)))

@@ -9,7 +9,7 @@ for equal shapes, no NaN for a dark lighting, twice the light is twice the resul
 the mean lightmap or `FitReport.status` says so. What statuses there are, and what each asks for: `STATUSES`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from pydantic import BaseModel, ConfigDict
 
+from ddprt.fitting.basis import Columns, block_entries
 from ddprt.methods.statuses import BLIND, NOTES, STATUSES, worst_first  # noqa: F401  (STATUSES is part of the contract)
 
 
@@ -38,13 +39,31 @@ class Frame:
     lightings: Sequence[Any] | None = None
 
 
+@runtime_checkable
+class Maps(Protocol):
+    """Scaled and encoded indirect light that stays on disk and comes in parts, as often as it is asked for."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Lightings, texels and 3."""
+        ...
+
+    def blocks(self) -> Iterator[Float[Array, "lightings block 3"]]:
+        """All texels in order, a whole number of tiles of `fit_basis` in each block but the last."""
+        ...
+
+    def some(self, lightings: slice) -> Float[Array, "some texels 3"]:
+        """Whole maps of some lightings."""
+        ...
+
+
 @dataclass(frozen=True)
 class Examples:
     """Pairs to learn from, lightings first.
 
     Attributes:
       frame: measurements of all lightings.
-      indirect: scaled and encoded indirect light.
+      indirect: scaled and encoded indirect light; `Maps` where it does not fit in memory and the method `streams`.
       scale: s of each lighting and channel; errors in W/m² are s times encoded ones.
       area: of the texels, m².
       weights: share of each texel in errors, summing to 1.
@@ -53,7 +72,7 @@ class Examples:
     """
 
     frame: Frame
-    indirect: Float[Array, "lightings texels 3"]
+    indirect: Float[Array, "lightings texels 3"] | Maps
     scale: Float[Array, "lightings 3"]
     area: Float[np.ndarray, " texels"]
     weights: str = "area"
@@ -124,9 +143,13 @@ class Relighter(Protocol):
 
 
 class Method(BaseModel):
-    """Base of the methods' settings records."""
+    """Base of the methods' settings records; those that can learn from `Maps` say that they `streams`.
+
+    A Relighter of a method that streams answers without `Frame.lightings`.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    streams: ClassVar[bool] = False
     relighter: ClassVar[type]
     why: ClassVar[str]
 
@@ -152,19 +175,52 @@ def array_bytes(relighter: Any) -> int:
     return sum(leaf.nbytes for leaf in jax.tree_util.tree_leaves(relighter))
 
 
-def columns(examples: Examples) -> tuple[Float[Array, "columns entries"], Float[Array, " columns"]]:
+def columns(examples: Examples) -> tuple[Float[Array, "columns entries"] | Columns, Float[Array, " columns"]]:
     """Indirect light as rows of the basis' data, and the scale of each.
 
     Mono channel gives a row per lighting and channel (all channels share one basis), multi channel one row per lighting
-    with colours interleaved. Dark rows are left out.
+    with colours interleaved. Dark rows are left out. Light that stays on disk gives rows that do.
     """
-    values, scale = examples.indirect, examples.scale
-    if examples.channels == "mono":
-        rows, size = jnp.moveaxis(values, 2, 1).reshape(-1, values.shape[1]), scale.reshape(-1)
-    else:
-        rows, size = values.reshape(len(values), -1), scale[:, 0]
+    values, mono = examples.indirect, examples.channels == "mono"
+    size = examples.scale.reshape(-1) if mono else examples.scale[:, 0]
     lit = np.flatnonzero(np.asarray(size) > 0)
+    if isinstance(values, Maps):
+        return _Rows(values, mono, lit), size[lit]
+    rows = _rows(values, mono)
     return (rows, size) if len(lit) == len(size) else (rows[lit], size[lit])
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """See `columns`."""
+
+    maps: Maps
+    mono: bool
+    lit: Int[np.ndarray, " columns"]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return len(self.lit), self.maps.shape[1] * (1 if self.mono else 3)
+
+    def blocks(self) -> Iterator[Array]:
+        every = self.maps.shape[0] * (3 if self.mono else 1)
+        for block in self.maps.blocks():
+            rows = _rows(block, self.mono)
+            yield rows if len(self.lit) == every else rows[self.lit]
+
+
+def _rows(values: Array, mono: bool) -> Array:
+    return jnp.moveaxis(values, 2, 1).reshape(-1, values.shape[1]) if mono else values.reshape(len(values), -1)
+
+
+def in_memory(light: Float[Array, "lightings texels 3"] | Maps) -> Float[Array, "lightings texels 3"]:
+    """All of it, for methods that do not stream."""
+    return jnp.concatenate(list(light.blocks()), 1) if isinstance(light, Maps) else light
+
+
+def block_texels(lightings: int) -> int:
+    """Texels of so many maps that go well in one block of `fit_basis`, whatever the channels."""
+    return block_entries(3 * lightings)
 
 
 @dataclass(frozen=True)
@@ -192,15 +248,16 @@ def measured(examples: Examples) -> list[Measured]:
     return [Measured(g, rows, groups[g][rows], scale[rows, g] ** 2) for g, rows in enumerate(lit) if len(rows)]
 
 
-def unseen_share(scale: Float[np.ndarray, "lightings 3"], indirect: Float[np.ndarray, "lightings texels 3"]) -> float:
-    """Share of the indirect light's squares in lightings and channels that no point sees, before encoding makes them black."""
-    squares = np.einsum("ltc,ltc->lc", indirect, indirect, dtype=np.float64)
+def unseen_share(scale: Float[np.ndarray, "lightings 3"], indirect: Iterable[Float[np.ndarray, "texels 3"]]) -> float:
+    """Share of the indirect light's squares that lies in lightings and channels that no point sees: encoding blackens it."""
+    squares = np.array([np.einsum("tc,tc->c", light, light, dtype=np.float64) for light in indirect]).reshape(-1, 3)
     total = float(squares.sum())
     return float(squares[np.asarray(scale) == 0].sum()) / total if total > 0 else 0.0
 
 
 def found_in(examples: Examples) -> set[str]:
     """Statuses that the data alone calls for, whatever is learned from it."""
+    light = examples.indirect
     dark = not bool((examples.scale > 0).any())
-    black = not bool((examples.indirect != 0).any())
+    black = not any(bool((part != 0).any()) for part in (light.blocks() if isinstance(light, Maps) else [light]))
     return {name for name, holds in (("no_signal", dark or black), ("blind", examples.unseen > BLIND)) if holds}

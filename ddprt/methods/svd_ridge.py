@@ -88,6 +88,7 @@ class SvdRidge(Method):
 
     relighter: ClassVar[type] = LinearTransfer
     why: ClassVar[str] = "the paper's baseline: closed form, linear, the reference point"
+    streams: ClassVar[bool] = True
     bases: int = Field(16, ge=1)
     centre: Literal["none", "mean"] = "none"
     ridge: Literal["auto"] | Annotated[float, Field(ge=0)] | tuple[Annotated[float, Field(ge=0)], ...] = "auto"

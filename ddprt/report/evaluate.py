@@ -11,12 +11,13 @@ from jaxtyping import Array
 from threadpoolctl import threadpool_limits
 
 from ddprt import seeds
+from ddprt.axes import Float32, Float64
 from ddprt.config import Config
 from ddprt.dataset.store import Dataset
 from ddprt.fitting.basis import entry_weights
 from ddprt.fitting.encoding import Encoding
 from ddprt.methods.statuses import BLIND
-from ddprt.report.metrics import Truth, negative_share, negative_shares, z_scores
+from ddprt.report.metrics import Maps, Truth, negative_share, negative_shares, z_scores
 from ddprt.runtime.model import Model
 from ddprt.runtime.train import fit_method
 from ddprt.scene.mesh import Scene
@@ -153,20 +154,40 @@ def projection_error(data: Dataset, model: Model, truth: Truth, bases: int | Non
     vectors = np.asarray(basis, np.float64)[:bases]
     if len(vectors) == 0:
         return truth.relative_rmse(truth.reference)
-    mono = vectors.shape[1] == len(truth.weight)
     measured = data.values(data.split("test"), model.points, model.quantity)
-    scale, encoded = _encoded(model.encoding, measured, truth.reference)
+    mean = np.asarray(getattr(model.relighter, "mean", 0.0), np.float64)
+    light = projected(model.encoding, vectors, mean, measured, truth.reference, data.area)
+    return truth.relative_rmse(light - truth.reference)
+
+
+def projected(
+    encoding: Encoding,
+    vectors: Float64[np.ndarray, "bases entries"],
+    mean: Float64[np.ndarray, "*shape"],
+    measured: Float32[np.ndarray, "lightings points 3"],
+    reference: Maps,
+    area: Float64[np.ndarray, " texels"],
+) -> Maps:
+    """Maps by the best possible coefficients: least squares under area weights, whatever weights the basis was made for.
+
+    Args:
+      encoding: of the model.
+      vectors: its basis; entries are texels (mono), or channels of texels (multi).
+      mean: what it is centred on, or 0.
+      measured: light at its points, W/m², which sets the scale.
+      reference: what is projected, W/m².
+      area: of the texels, m².
+    """
+    mono = vectors.shape[1] == len(area)
+    scale, encoded = _encoded(encoding, measured, reference)
     encoded = np.asarray(encoded, np.float64)
     rows = np.moveaxis(encoded, 2, 1) if mono else encoded.reshape(len(encoded), 1, -1)
-    mean = np.asarray(getattr(model.relighter, "mean", 0.0), np.float64)
-    weights = entry_weights(data.area, "area", "mono" if mono else "multi").astype(np.float64)
-    # Least squares under area weights, whatever weights the basis was made for.
+    weights = entry_weights(area, "area", "mono" if mono else "multi").astype(np.float64)
     gram = (vectors * weights) @ vectors.T
     coefficients = np.linalg.solve(gram, (((rows - mean) * weights) @ vectors.T).reshape(-1, len(vectors)).T).T
     light = coefficients.reshape(*rows.shape[:2], -1) @ vectors + mean
     back = np.moveaxis(light, 1, 2) if mono else light.reshape(encoded.shape)
-    decoded = np.asarray(_decoded(model.encoding, back.astype(np.float32), scale))
-    return truth.relative_rmse(decoded - truth.reference)
+    return np.asarray(_decoded(encoding, back.astype(np.float32), scale))
 
 
 @jax.jit

@@ -269,6 +269,26 @@ def z_histogram(check: Mapping[str, Any]) -> str:
     return _plot("zscores", draw)
 
 
+def budget_bars(budget: Mapping[str, Any]) -> str:
+    """Relative RMSE of each part of the error, and of the whole; shares of the square beside them."""
+
+    def draw(axes: Any) -> None:
+        rows = [*((part["cause"], part["relative_rmse"], part["share"]) for part in budget["parts"])]
+        rows.append(("all", budget["total"]["relative_rmse"], 1.0))
+        names, values, shares = zip(*rows, strict=True)
+        colours = [SERIES["first"]] * (len(rows) - 1) + [INK["muted"]]
+        axes.barh(range(len(rows)), 100 * np.array(values), color=colours, height=0.62)
+        for row, (value, share) in enumerate(zip(values, shares, strict=True)):
+            axes.annotate(f"{100 * share:.1f} %", (100 * value, row), (4, 0), textcoords="offset points", va="center")
+        axes.set(yticks=range(len(rows)), yticklabels=names, xlabel="relative RMSE (%); beside: share of the square")
+        axes.set(xlim=(0, 122 * max(values)))
+        axes.invert_yaxis()
+        axes.grid(False, axis="y")
+        axes.set_position((0.29, 0.15, 0.69, 0.81))
+
+    return _plot("budget", draw)
+
+
 def loss_history(report: FitReport) -> str:
     """Training and validation loss of a learned method."""
 

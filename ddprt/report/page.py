@@ -62,6 +62,7 @@ def write_page(
     plan_effects: Sequence[Effect] | None = None,
     effect_costs: Mapping[str, Mapping[str, Any]] | None = None,
     command: str = "",
+    budget: Mapping[str, Any] | None = None,
 ) -> Path:
     """Writes the report.
 
@@ -76,6 +77,7 @@ def write_page(
       plan_effects: the plan's effects; None takes those that the dataset was baked with.
       effect_costs: rays, seconds and energy_share by name of the effect, where they are known.
       command: that makes this report again.
+      budget: contents of budget.json, where the error was taken apart.
     Returns:
       The path.
     Raises:
@@ -110,7 +112,9 @@ def write_page(
         warnings=warnings(evaluation, main, effects, data.description["scene"].get("notes", ())),
         columns=[label for label, _ in _METHOD_KEYS.values()],
         methods=method_table(evaluation.metrics["methods"]),
-        plots=figures.plots(evaluation, {name: model.relighter.report for name, model in models.items()}, main),
+        plots=figures.plots(evaluation, {name: model.relighter.report for name, model in models.items()}, main)
+        | ({"budget": figures.budget_bars(budget)} if budget else {}),
+        budget=budget,
         check=evaluation.spot_check,
         effects=effects,
         costs=effect_costs or {},

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import csr_matrix
 
-from ddprt.axes import Bool, Float, Float32, Float64
+from ddprt.axes import Bool, Float, Float32, Float64, Int
 from ddprt.scene.mesh import Scene
 from ddprt.transport.embree import Hits, Tracer
 
@@ -130,11 +130,30 @@ def take_view(
     row, column = np.divmod(hit, width * _GRID)
     pixel = row // _GRID * width + column // _GRID
     triangle, weights = hits.triangle[hit], np.stack([1 - hits.u[hit] - hits.v[hit], hits.u[hit], hits.v[hit]], 1)
-    texels, shares = _bilinear(np.einsum("nc,ncd->nd", weights, uv[triangle]), covered)
-    share = 1 / _GRID**2
-    entries = (share * shares).ravel(), (np.repeat(pixel, 4), texels.ravel())
-    lookup = csr_matrix(entries, (height * width, int(covered.sum())))
+    place, share = np.einsum("nc,ncd->nd", weights, uv[triangle]), 1 / _GRID**2
+    lookup = look_up(place, pixel, np.full(len(hit), share), height * width, covered)
     return View(camera, lookup, (share * np.bincount(pixel, minlength=height * width)).reshape(height, width))
+
+
+def look_up(
+    place: Float64[np.ndarray, "n 2"],
+    row: Int[np.ndarray, " n"],
+    share: Float64[np.ndarray, " n"],
+    rows: int,
+    covered: Bool[np.ndarray, "height width"],
+) -> csr_matrix:
+    """Bilinear look-ups in a lightmap as a (rows, texels) matrix: each row is the sum of `share` times those that go to it.
+
+    Args:
+      place: on the lightmap, in the unit square.
+      row: where each goes.
+      share: its weight there.
+      rows: how many there are.
+      covered: texels that carry light; only they are looked up.
+    """
+    texels, weights = _bilinear(place, covered)
+    entries = (share[:, None] * weights).ravel(), (np.repeat(row, 4), texels.ravel())
+    return csr_matrix(entries, (rows, int(covered.sum())))
 
 
 def first_fronts(tracer: Tracer, eye: Float64[np.ndarray, "3"], directions: Float32[np.ndarray, "rays 3"]) -> Hits:

@@ -1,25 +1,28 @@
 """From a dataset to a Model."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float, Float32
 from threadpoolctl import threadpool_limits
 
 from ddprt import seeds
 from ddprt.config import Config
+from ddprt.dataset.pack import Pack
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.fitting.encoding import Encoding
 from ddprt.lights import Lighting
 from ddprt.methods import make_method
-from ddprt.methods.floors import MeanLightmap
-from ddprt.methods.method import Examples, Frame, Relighter, unseen_share
+from ddprt.methods.floors import MeanLightmap, MeanMap
+from ddprt.methods.method import Examples, Frame, Maps, Method, Relighter, block_texels, unseen_share
 from ddprt.methods.statuses import BLIND
 from ddprt.runtime.model import Model
 from ddprt.runtime.trust import Yardstick, calibrated, make_yardstick, outside
@@ -27,6 +30,9 @@ from ddprt.sections import FitConfig
 
 ROUNDING = 1e-6
 """Relative error that float32 makes by itself: an eps for each of some 16 bases, with random signs and room for more."""
+
+_WORTH_PACKING = 2**22  # bytes of half floats: below, reading the maps one by one takes a fifth of a second or less
+_SHARE = 0.25  # of the free memory: an in-memory fit holds the light three times over, and others want some too
 
 USELESS = 0.99
 """Share of the error of black from which a method counts as no better than it."""
@@ -89,8 +95,13 @@ def fit_method(
     points: int | None,
     quantity: str,
     seed: int,
+    stream: bool | None = None,
 ) -> Model:
-    """The same from a [fit] section; `name` overrides its method."""
+    """The same from a [fit] section; `name` overrides its method.
+
+    Light that takes more than a quarter of the free memory is read a part at a time by methods that can (`Method.streams`);
+    `stream` says so or not whatever the sizes. The model is the same but for rounding.
+    """
     method = make_method(name, config.model_dump(exclude={"method", "points"}), settings)
     points = data.description["points"]["count"] if points is None else points
     if points > len(data.samples.position):
@@ -98,7 +109,8 @@ def fit_method(
     if not data.area.sum() > 0:
         raise UserError("area: got texels of 0 m² alone, expected some surface to light; check the atlas and bake again")
     encoding = Encoding(config.space, config.gamma, config.channels)
-    train, validation = (examples(data, split, encoding, config, points, quantity) for split in ("train", "validation"))
+    pack = _streamed(data, method, name, stream)
+    train, validation = (examples(data, split, encoding, config, points, quantity, pack) for split in ("train", "validation"))
     relighter = method.fit(train, validation, key=jax.random.key(seeds.number(seed, f"method {name}")))
     relighter, yardstick = _judged(relighter, encoding, train, validation)
     return Model(
@@ -119,14 +131,10 @@ def fit_method(
 
 def _judged(relighter: Relighter, encoding: Encoding, train: Examples, validation: Examples) -> tuple[Relighter, Yardstick]:
     """The laws that a method beats mean lightmap and black on its validation set and was trained on its kind, or says not."""
-    mean = MeanLightmap().fit(train, validation, key=jax.random.key(0))
-    frame = validation.frame
-    area = jnp.asarray(validation.area / validation.area.sum(dtype=np.float64), jnp.float32)
-    data = frame.values, frame.positions, frame.normals, validation.indirect, validation.scale, area
-    lightings = None if frame.lightings is None else tuple(frame.lightings)
-    ours, floor, whole = (np.asarray(_squares(one, encoding, *data, lightings), np.float64) for one in (relighter, mean, None))
+    mean = _mean_lightmap(train, validation)
+    ours, floor, whole = (_squares(one, encoding, validation) for one in (relighter, mean, None))
     yardstick = make_yardstick(train, encoding)
-    novelty = yardstick.novelty(frame.values, validation.scale)
+    novelty = yardstick.novelty(validation.frame.values, validation.scale)
     lit = whole > 0
     of_ours, of_mean = (np.sqrt(np.divide(part, whole, out=np.full_like(whole, np.nan), where=lit)) for part in (ours, floor))
     yardstick = calibrated(yardstick, novelty, of_ours, of_mean)
@@ -140,8 +148,44 @@ def _judged(relighter: Relighter, encoding: Encoding, train: Examples, validatio
     return replace(relighter, report=report), yardstick  # type: ignore[type-var]
 
 
+def _mean_lightmap(train: Examples, validation: Examples) -> MeanMap:
+    fitted = lambda part: MeanLightmap().fit(part, validation, key=jax.random.key(0))  # noqa: E731
+    if not isinstance(train.indirect, Maps):
+        return fitted(train)
+    means: list[Array] = []
+    start = 0
+    for block in train.indirect.blocks():
+        stop = start + block.shape[1]
+        means.append(jax.block_until_ready(fitted(replace(train, indirect=block, area=train.area[start:stop])).mean))
+        start = stop
+    return MeanMap(jnp.concatenate(means))
+
+
+def _squares(relighter: Relighter | None, encoding: Encoding, examples: Examples) -> np.ndarray:
+    """Area-weighted squared error of each lighting (None answers with black), in units of the peak to keep in range."""
+    light, frame = examples.indirect, examples.frame
+    area = jnp.asarray(examples.area / examples.area.sum(dtype=np.float64), jnp.float32)
+    if isinstance(light, Maps):
+        step = max(1, block_texels(1) // max(light.shape[1], 1))
+        parts = [slice(start, start + step) for start in range(0, light.shape[0], step)]
+        lightings = None  # of methods that stream none asks for them
+    else:
+        parts, lightings = [slice(None)], None if frame.lightings is None else tuple(frame.lightings)
+    squares, peaks = [], []
+    for part in parts:
+        truth = light.some(part) if isinstance(light, Maps) else light
+        values = frame.values if truth is light else frame.values[part]
+        scale = examples.scale if truth is light else examples.scale[part]
+        largest = jnp.max(examples.scale, initial=0)
+        found = _squares_of(relighter, encoding, values, frame.positions, frame.normals, truth, scale, largest, area, lightings)
+        squares.append(np.asarray(found[0], np.float64))
+        peaks.append(float(found[1]))
+    unit = max((peak for peak in peaks if peak > 0), default=1.0)
+    return np.concatenate([part * ((peak or 1.0) / unit) ** 2 for part, peak in zip(squares, peaks, strict=True)])
+
+
 @partial(jax.jit, static_argnames="lightings")
-def _squares(
+def _squares_of(
     relighter: Relighter | None,
     encoding: Encoding,
     values: Array,
@@ -149,38 +193,154 @@ def _squares(
     normals: Array,
     indirect: Array,
     scale: Array,
+    largest: Array,
     area: Array,
     lightings: tuple[Lighting, ...] | None,
-) -> Array:
-    """Area-weighted squared error of each lighting (None answers with black), in units of the peak to keep in range."""
-    relative = scale / jnp.maximum(jnp.max(scale), jnp.finfo(jnp.float32).tiny)
+) -> tuple[Array, Array]:
+    """The squares of some lightings in units of the peak of their own, and that peak."""
+    relative = scale / jnp.maximum(largest, jnp.finfo(jnp.float32).tiny)
     truth = encoding.decode(indirect, relative)
     peak = jnp.max(jnp.abs(truth), initial=0)
     answer = (
         0.0 if relighter is None else encoding.decode(relighter.predict(Frame(values, positions, normals, lightings)), relative)
     )
-    return jnp.einsum("ltc,t->l", ((answer - truth) / jnp.where(peak > 0, peak, 1)) ** 2, area)
+    return jnp.einsum("ltc,t->l", ((answer - truth) / jnp.where(peak > 0, peak, 1)) ** 2, area), peak
 
 
-def examples(data: Dataset, split: str, encoding: Encoding, config: FitConfig, points: int, quantity: str) -> Examples:
-    """Scaled and encoded pairs of a split: here arrays pass from NumPy to JAX."""
+def examples(
+    data: Dataset, split: str, encoding: Encoding, config: FitConfig, points: int, quantity: str, pack: Pack | None = None
+) -> Examples:
+    """Scaled and encoded pairs of a split: here arrays pass from NumPy to JAX.
+
+    Args:
+      data: the dataset.
+      split: "train" or "validation".
+      encoding: of values and light.
+      config: weights and channels.
+      points: how many.
+      quantity: "radiosity" or "irradiance" at the points.
+      pack: leaves the indirect light in it, to be read a part at a time.
+    """
     indices = data.split(split)
-    light = data.maps("indirect", indices)
-    values, scale, indirect = _encoded(encoding, data.values(indices, points, quantity), light)
+    values, scale = _measured(encoding, data.values(indices, points, quantity))
     frame = Frame(
         values,
         jnp.asarray(data.samples.position[:points], jnp.float32),
         jnp.asarray(data.samples.normal[:points], jnp.float32),
         [data.lightings[index] for index in indices],
     )
-    unseen = unseen_share(np.asarray(scale), light)
+    if pack is None:
+        light = data.maps("indirect", indices)
+        indirect: Array | Maps = _encoded(encoding, light, scale)
+        unseen = unseen_share(np.asarray(scale), light)
+    else:
+        indirect = StreamedMaps(pack, tuple(indices), encoding, scale)
+        dark = bool((np.asarray(scale) == 0).any())  # else there is no need to look
+        unseen = unseen_share(np.asarray(scale), (pack.read([index])[0] for index in indices)) if dark else 0.0
     return Examples(frame, indirect, scale, np.asarray(data.area, np.float32), config.weights, config.channels, unseen)
 
 
 @jax.jit
-def _encoded(encoding: Encoding, values: Array, indirect: Array) -> tuple[Array, Array, Array]:
+def _measured(encoding: Encoding, values: Array) -> tuple[Array, Array]:
     scale = encoding.scale(values)
-    return encoding.encode(values, scale), scale, encoding.encode(indirect, scale)
+    return encoding.encode(values, scale), scale
+
+
+@jax.jit
+def _encoded(encoding: Encoding, indirect: Array, scale: Array) -> Array:
+    return encoding.encode(indirect, scale)
+
+
+@dataclass(frozen=True, eq=False)
+class StreamedMaps:
+    """Indirect light of a split that stays in its pack; see `Maps`. A thread reads what comes next meanwhile.
+
+    Attributes:
+      pack: where the light lies.
+      indices: of the lightings.
+      encoding: what it is encoded with.
+      scale: of the lightings.
+    """
+
+    pack: Pack
+    indices: tuple[int, ...]
+    encoding: Encoding
+    scale: Float[Array, "lightings 3"]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """See `Maps`."""
+        return len(self.indices), self.pack.texels, 3
+
+    def blocks(self) -> Iterator[Float[Array, "lightings block 3"]]:
+        """See `Maps`."""
+        for light in self._read(block_texels(len(self.indices))):
+            yield self._encode(light, self.scale)
+
+    def some(self, lightings: slice) -> Float[Array, "some texels 3"]:
+        """See `Maps`."""
+        return self._encode(self.pack.read(self.indices[lightings]), self.scale[lightings])
+
+    def _encode(self, light: np.ndarray, scale: Array) -> Array:
+        with jax.enable_x64(False):  # as in memory, whoever asks
+            return _encoded(self.encoding, light, scale)
+
+    def _read(self, texels: int) -> Iterator[Float32[np.ndarray, "lightings block 3"]]:
+        """Light in blocks of so many texels, one ahead of what has been asked for."""
+
+        def read(start: int) -> np.ndarray:
+            stop, after = (min(start + count * texels, self.pack.texels) for count in (1, 2))
+            self.pack.expect(self.indices, stop, after)
+            return self.pack.read(self.indices, start, stop)
+
+        starts = range(0, self.pack.texels, texels)
+        with ThreadPoolExecutor(1) as reader:
+            coming = [reader.submit(read, starts[0])]
+            for start in (*starts[1:], None):
+                light = coming.pop().result()
+                if start is not None:
+                    coming.append(reader.submit(read, start))
+                yield light
+                del light
+
+
+def _streamed(data: Dataset, method: Method, name: str, asked: bool | None) -> Pack | None:
+    """The pack to read a part at a time, None for what is to be held in memory; large maps are packed either way.
+
+    Raises:
+      UserError: the light cannot fit in memory, and must.
+    """
+    lightings = len(data.split("train")) + len(data.split("validation"))
+    size, free = 12 * len(data.area) * lightings, _free_memory()
+    wanted = asked or (asked is None and method.streams and free is not None and size > _SHARE * free)
+    pack = data.packed() if wanted or size // 2 > _WORTH_PACKING else None
+    if wanted:
+        if method.streams and pack is not None:
+            return pack
+        if asked:
+            why = "its folder cannot be written to" if method.streams else "the method holds all light in memory"
+            raise UserError(f"stream: got true for {name}, but {why}; leave it out")
+    if free is not None and 2 * size > free:
+        raise UserError(
+            f"{name}: got {size / 2**30:.3g} GiB of light that it holds twice, but {free / 2**30:.3g} GiB of memory are free; "
+            "use svd-ridge and a folder that can be written to, fewer lightings, or a machine with more memory"
+        )
+    return None
+
+
+def _free_memory() -> int | None:
+    """Bytes that this process can still have, swap not counted; None where the system does not tell (it is Linux that does)."""
+    try:
+        lines = Path("/proc/meminfo").read_text("utf-8").splitlines()
+        free = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
+    except (OSError, StopIteration):
+        return None
+    try:
+        group = Path("/sys/fs/cgroup")
+        limit, used = ((group / name).read_text("utf-8").strip() for name in ("memory.max", "memory.current"))
+        return free if limit == "max" else min(free, max(0, int(limit) - int(used)))
+    except (OSError, ValueError):
+        return free
 
 
 def fit_config(data: Dataset, config: Config, name: str) -> Model:

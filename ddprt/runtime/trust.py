@@ -14,6 +14,7 @@ validation lightings, near 1/2 where error is what novelty takes out of the ligh
 
 import math
 from dataclasses import dataclass, fields, replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +24,7 @@ from jaxtyping import Array, Bool, Float
 from ddprt.fitting.basis import entry_weights
 from ddprt.fitting.encoding import Encoding
 from ddprt.fitting.selection import RANK_CUT, Spectrum, choose_ridge, decompose
-from ddprt.methods.method import Examples, measured
+from ddprt.methods.method import Examples, Maps, measured
 
 FALSE_ALARMS = 0.05
 """Share of lightings like the training ones that are called extrapolating."""
@@ -167,14 +168,30 @@ def _left_out(spectrum: Spectrum, ridge: float) -> np.ndarray:
 def _sketched(train: Examples) -> np.ndarray:
     """(groups, lightings, _SKETCH) random combinations of the encoded texels."""
     entries = jnp.asarray(entry_weights(train.area, train.weights, train.channels))  # type: ignore[arg-type]
-    rows = train.indirect if train.channels == "mono" else train.indirect.reshape(len(train.indirect), -1, 1)
-    return np.asarray(_sketch(rows, entries))
+    shape = lambda light: light if train.channels == "mono" else light.reshape(len(light), -1, 1)  # noqa: E731
+    if not isinstance(train.indirect, Maps):
+        return np.asarray(_sketch(shape(train.indirect), entries))
+    signs, start = _signs(len(entries)), 0
+    total = np.zeros(())
+    for block in map(shape, train.indirect.blocks()):
+        stop = start + block.shape[1]
+        total, start = total + np.asarray(_combined(block, entries[start:stop], signs[start:stop]), np.float64), stop
+    return total.astype(np.float32)
 
 
 @jax.jit
 def _sketch(rows: Array, entries: Array) -> Array:
-    signs = jax.random.rademacher(jax.random.key(0), (rows.shape[1], _SKETCH), jnp.float32)
-    return jnp.einsum("lec,es->cls", rows, jnp.sqrt(entries / _SKETCH)[:, None] * signs, precision="highest")
+    return _combined(rows, entries, _signs(rows.shape[1]))
+
+
+def _combined(rows: Array, entries: Array, signs: Array) -> Array:
+    weights = jnp.sqrt(entries / _SKETCH)[:, None] * signs.astype(jnp.float32)
+    return jnp.einsum("lec,es->cls", rows, weights, precision="highest")
+
+
+@partial(jax.jit, static_argnums=0)
+def _signs(entries: int) -> Array:
+    return jax.random.rademacher(jax.random.key(0), (entries, _SKETCH), jnp.int8)
 
 
 def _mean(train: Examples, encoding: Encoding) -> np.ndarray:

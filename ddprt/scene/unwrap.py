@@ -1,7 +1,6 @@
 """Charts by xatlas, packed to exactly the resolution that was asked for, remembered by mesh hash."""
 
 import hashlib
-import os
 import tempfile
 from pathlib import Path
 from zipfile import BadZipFile
@@ -11,6 +10,7 @@ import xatlas
 
 from ddprt.axes import Float64, Int32
 from ddprt.errors import UserError
+from ddprt.files import cache_folder
 from ddprt.scene.folds import folded
 from ddprt.scene.mesh import Scene
 from ddprt.scene.patches import Patches, cut, hard_parts
@@ -38,7 +38,7 @@ def unwrap(
       UserError: the charts cannot be packed into so few texels.
     """
     key = hashlib.sha256(f"{_FORMAT} {scene.digest} {resolution} {padding} {xatlas.__version__}".encode()).hexdigest()[:24]
-    path = _cache_folder() / f"unwrap-{key}.npz"
+    path = cache_folder() / f"unwrap-{key}.npz"
     try:
         with np.load(path) as stored:
             return stored["uv"], stored["chart"]
@@ -168,11 +168,6 @@ def _pack(
     if not (order == corners).all() or not (vertex == np.arange(len(flat))).all():
         return None
     return np.clip(uv * [atlas.width / resolution, atlas.height / resolution], 0, 1)
-
-
-def _cache_folder() -> Path:
-    base = os.environ.get("DDPRT_CACHE") or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ddprt"
-    return Path(base)
 
 
 def _remember(path: Path, **arrays: np.ndarray) -> None:

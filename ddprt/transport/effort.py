@@ -10,12 +10,15 @@ from ddprt import seeds
 from ddprt.axes import Float32, Float64, Int
 from ddprt.sections import TransportConfig
 from ddprt.transport.footprint import Footprints, find_footprints
+from ddprt.transport.gather import Receivers
 from ddprt.transport.near import NearField, columns_of
 from ddprt.transport.operator import Operator
 
 _PILOT = 8  # rays of every texel that tell distances and variances, and are thrown away
 _PROBED = 1024  # texels whose noise is measured
-_TIMED = 64, 1088  # texels of each thread: the difference tells how long a ray takes
+_TIMED = 1 << 18  # rays of each thread, at most, that tell how long one takes
+_TIMED_SHARE = 8  # of all rays, this part at most
+_TILES = 8  # neighbours' tiles that go through together in a gather
 _LIGHTINGS = 32  # that are looked at
 _FEW, _MANY = 24, 96  # rays there, twice each; no powers of two, which do 10 % better than what lies between
 _WIDE = 0.4  # of the harmonic mean distance: over how far variances seen by few rays are averaged
@@ -32,11 +35,16 @@ class Choice:
       rays: of each texel.
       footprints: neighbours that share rays; None where none do.
       facts: mean rays, expected relative RMSE of the maps, seconds of the gather, variance over that of an even share.
+      power: how fast variance falls with the number of rays; 1 for independent ones.
+      seconds, traced: of the gather, both halves of held-out maps; with the rays that go on from near senders.
     """
 
     rays: Int[np.ndarray, " texels"]
     footprints: Footprints | None
     facts: dict[str, Any]
+    power: float = 1.0
+    seconds: float = 0.0
+    traced: int = 0
 
 
 def choose_rays(
@@ -65,7 +73,7 @@ def choose_rays(
     halves, samples = (2, config.test_samples) if held_out else (1, config.samples)
     footprint, adaptive = (0.0, False) if held_out else (config.footprint, config.adaptive)
     area = operator.atlas.area
-    each = _seconds_per_ray(operator, radiosity, near)
+    whole = radiosity, near
     lightings = radiosity.shape[1] // 3
     chosen = np.unique(np.linspace(0, lightings - 1, min(lightings, _LIGHTINGS)).astype(int))  # enough to tell what is needed
     radiosity, near = columns_of(radiosity, chosen), near.some(chosen) if near else None
@@ -85,31 +93,58 @@ def choose_rays(
     rays = np.maximum(1, np.rint(share * (samples / halves))).astype(np.int64)
     expected = np.sqrt(few * ratio * (samples / halves / _FEW) ** -power / halves)
     facts = {"samples": round(float(rays.mean()) * halves, 1), "noise_expected": float(f"{expected:.3g}")}
-    facts["seconds_expected"] = float(f"{each * rays.sum() * halves:.2g}")
+    each, traced = (per_ray * rays.sum() * halves for per_ray in _cost_per_ray(operator, *whole, rays))
+    facts["seconds_expected"] = float(f"{each:.2g}")
     if adaptive:
         facts["variance_over_even"] = round(ratio, 3)
-    return Choice(rays, footprints, facts)
+    return Choice(rays, footprints, facts, power, float(each), int(traced))
 
 
-def _seconds_per_ray(operator: Operator, radiosity: Float32[np.ndarray, "senders columns"], near: NearField | None) -> float:
-    """How long a ray takes on all threads together, with all lightings and with what near senders cost.
+def _cost_per_ray(
+    operator: Operator,
+    radiosity: Float32[np.ndarray, "senders columns"],
+    near: NearField | None,
+    rays: Int[np.ndarray, " texels"],
+) -> tuple[float, float]:
+    """Seconds that a ray takes on all threads together, with all lightings and near senders, and rays traced for each.
 
-    Each thread gathers for texels of its own: a few tiles shared out between many threads would leave most of them idle. What
-    a call costs before its first ray, as much as a hundred thousand rays, is in both sizes and drops out.
+    Each thread gathers a stretch as the bake will: as many neighbours with as many rays each, since rays of neighbours cost
+    less than scattered ones, fewer of them stay in the cache where texels have few, and every stretch lights its near senders
+    once for every lighting, which on a statue costs as much as its rays. What a call costs before its first ray is in a call
+    for a single texel, and drops out.
     """
-    threads, spent = operator.tracer.threads, []
-    for count in _TIMED:
-        texels = np.linspace(0, operator.atlas.count - 1, count).astype(int)
+    threads = operator.tracer.threads
+    values, numbers = np.unique(rays[rays > 0], return_counts=True)
+    usual = int(values[np.argmax(values * numbers)])  # of the texels that hold most of the rays
+    there = np.flatnonzero(rays == usual)
+    tile = _tile(operator, usual)
+    most = min(_TIMED, int(rays.sum()) // (_TIMED_SHARE * threads)) // usual
+    windows, size = max(1, min(_TILES, most // tile)), min(tile, max(most, 16), len(there))
+    starts = np.linspace(0, len(there) - size, windows * threads).astype(int).reshape(windows, threads)
+    spent = []
+    for single in (True, False):
 
-        def work(thread: int, texels: Int[np.ndarray, " timed"] = texels) -> None:
-            operator.gather_some(radiosity, texels, _MANY, seed=thread, stream="rate", near=near)
+        def work(thread: int, single: bool = single) -> int:
+            own = np.unique(np.concatenate([there[first : first + size] for first in starts[:, thread]]))
+            texels = own[:1] if single else own
+            field = None if single else near
+            operator.gather_some(radiosity, texels, usual, seed=thread, stream="rate", near=field)
+            return len(texels)
 
-        begun = time.perf_counter()
-        for _ in operator.tracer.map(work, range(threads)):
-            pass
-        spent.append(time.perf_counter() - begun)
-    few, many = _TIMED
-    return max(spent[1] - spent[0], 0.1 * spent[1]) / ((many - few) * _MANY * threads)  # a busy machine may turn them around
+        begun, before = time.perf_counter(), operator.tracer.rays
+        asked = usual * sum(operator.tracer.map(work, range(threads)))
+        spent.append(np.array([time.perf_counter() - begun, operator.tracer.rays - before, asked]))
+    seconds, traced, asked = spent[1] - spent[0]
+    if asked == 0:  # an atlas of a single texel
+        seconds, traced, asked = spent[1]
+    return max(seconds, 0.1 * spent[1][0]) / asked, traced / asked  # a busy machine may turn the two around
+
+
+def _tile(operator: Operator, samples: int) -> int:
+    """Texels whose rays a gather traces together."""
+    some = Receivers.texels(operator.atlas, samples, 0, "rate", np.arange(min(operator.atlas.count, _MOST)))
+    first = next(some.tiles())
+    return first.stop - first.start
 
 
 def allot(
@@ -124,6 +159,7 @@ def allot(
       variance: of one ray.
       burden: weight of each texel's variance in the total squared error.
       power: how fast variance falls with the number of rays; 1 for independent ones.
+      seconds, traced: of the gather, both halves of held-out maps; with the rays that go on from near senders.
     Returns:
       The expected variance over that of an even share, and rays over their mean: 1 and ones where even is about as good.
     """

@@ -1,0 +1,229 @@
+"""Which setting to try next so that a budget is met with few trials: models of cost and error, fitted as trials come in.
+
+A trial bakes, which is dear; how many bases are kept and in which precision they are stored is then a matter of
+milliseconds. So a place is a choice of the dear knobs, and each trial of a place tells the errors of all numbers of bases at
+once. Costs are power laws of the knobs: log q = c + sum beta log(knob / base), whose exponents have a prior from how the code
+works and learn from the trials (Bayesian linear regression). Squared errors add up: e² = truncation² + rest², where truncation
+depends on the bases alone and the rest, what even all bases leave, is a power law of the knobs.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+from math import log
+
+import numpy as np
+from scipy.special import log_ndtr
+
+from ddprt.axes import Float64
+
+QUANTITIES = ("relative_rmse", "frame_us", "megabytes", "bake_seconds", "fit_seconds")
+"""What a budget may limit."""
+KNOBS = ("atlas.resolution", "lightings.train", "transport.target_noise", "points.count")
+"""Dear knobs, each of which asks for another bake."""
+_SURE = 0.9  # chance of meeting a limit from which a plan counts as safe
+_HOPELESS = 0.02
+_AGAIN = 0.03  # by how much a measurement differs when it is made again, in logarithms
+_TINY = 1e-12
+_FREE = 3.0  # standard deviation of a constant that nothing is known of, in logarithms
+
+_PRIOR: dict[str, tuple[tuple[float, ...], tuple[float, ...], float]] = {
+    "rest": ((-0.4, -0.5, 0.1, -0.3), (0.4, 0.4, 0.15, 0.3), 0.05),
+    "frame_us": ((2.0, 0.0, 0.0, 0.0), (0.3, 0.01, 0.01, 0.05), 0.08),
+    "megabytes": ((2.0, 0.0, 0.0, 0.05), (0.05, 0.001, 0.001, 0.05), 0.01),
+    "bake_seconds": ((1.5, 0.6, -0.8, 0.1), (0.5, 0.4, 0.5, 0.15), 0.1),
+    "fit_seconds": ((1.3, 1.0, 0.0, 0.3), (0.5, 0.5, 0.02, 0.3), 0.1),
+}
+"""Exponents of the knobs, how sure they are, and by how much a measurement is off its law, in logarithms."""
+
+Place = tuple[float, ...]
+"""Values of `KNOBS`."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A setting that could be tried: a place, a number of bases, a precision."""
+
+    place: Place
+    bases: int
+    precision: str
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What a place was found to be.
+
+    Attributes:
+      place: where.
+      bases: numbers of bases that were scored, rising.
+      errors: relative RMSE at each, and its standard error over held-out lightings, as a share.
+      frame_us, megabytes: at each, by precision.
+      bake_seconds, fit_seconds: of the whole.
+    """
+
+    place: Place
+    bases: tuple[int, ...]
+    errors: tuple[float, ...]
+    error_spread: float
+    frame_us: tuple[float, ...]
+    megabytes: dict[str, tuple[float, ...]]
+    bake_seconds: float
+    fit_seconds: float
+
+
+@dataclass(frozen=True)
+class Guess:
+    """Logarithm of a quantity: what is expected, and how far off that may be."""
+
+    mean: float
+    spread: float
+
+    def chance(self, limit: float) -> float:
+        """Logarithm of the chance that it is within a limit."""
+        return float(log_ndtr((log(limit) - self.mean) / max(self.spread, 1e-6)))
+
+
+@dataclass(frozen=True)
+class Law:
+    """A power law with what is known of its constant and exponents.
+
+    Attributes:
+      mean, covariance: of (constant, exponents), in logarithms.
+      noise: by how much a measurement is off it.
+    """
+
+    mean: Float64[np.ndarray, " terms"]
+    covariance: Float64[np.ndarray, "terms terms"]
+    noise: float
+
+    @classmethod
+    def of(
+        cls,
+        rows: Float64[np.ndarray, "trials terms"],
+        told: Float64[np.ndarray, " trials"],
+        exponents: tuple[float, ...],
+        sure: tuple[float, ...],
+        noise: float,
+    ) -> "Law":
+        """After trials: the posterior of a Gaussian prior under Gaussian noise."""
+        told = np.log(np.maximum(told, _TINY))
+        prior = np.concatenate([[told[0] - rows[0, 1:] @ exponents], exponents])  # the constant is about that of the first
+        precision = np.diag(1 / np.array([_FREE, *sure]) ** 2)
+        covariance = np.linalg.inv(precision + rows.T @ rows / noise**2)
+        return cls(covariance @ (precision @ prior + rows.T @ told / noise**2), covariance, noise)
+
+    def at(self, row: Float64[np.ndarray, " terms"]) -> Guess:
+        """What it says of a place."""
+        return Guess(float(row @ self.mean), float(np.sqrt(row @ self.covariance @ row + self.noise**2)))
+
+
+@dataclass
+class Planner:
+    """Remembers trials, and says what to try next.
+
+    Args:
+      base: the place that all others are relative to.
+      values: what each knob may be, in the order of `KNOBS`.
+      bases: numbers of bases that may be asked for, rising.
+      precisions: that may be stored.
+      limits: the budget; quantities that are missing are free.
+    """
+
+    base: Place
+    values: Sequence[Sequence[float]]
+    bases: Sequence[int]
+    precisions: Sequence[str]
+    limits: Mapping[str, float]
+    trials: list[Trial] = field(default_factory=list)
+    _laws: dict[str, Law] = field(default_factory=dict)
+
+    def add(self, trial: Trial) -> None:
+        """Learns from a trial."""
+        self.trials.append(trial)
+        rows = np.array([self._row(each.place) for each in self.trials])
+        self._laws = {
+            name: Law.of(rows, np.array([_told(name, each) for each in self.trials]), *_PRIOR[name]) for name in _PRIOR
+        }
+
+    def next(self) -> tuple[Plan, float]:
+        """The plan that is likeliest to meet the budget, and the chance that it does.
+
+        Of plans that are safe the one with the least error is taken where no error is asked for, else the cheapest bake.
+        """
+        best: tuple[tuple[float, float], Plan, float] | None = None
+        for place in product(*self.values):
+            told = self._of_place(place)
+            for bases, precision in product(self.bases, self.precisions):
+                guesses = self._guesses(told, bases, precision)
+                chance = float(np.exp(sum(guesses[name].chance(limit) for name, limit in self.limits.items())))
+                wanted = guesses["bake_seconds" if "relative_rmse" in self.limits else "relative_rmse"].mean
+                rank = (min(chance, _SURE), -wanted)
+                if best is None or rank > best[0]:
+                    best = rank, Plan(place, bases, precision), chance
+        assert best is not None, "every knob has a value"
+        return best[1], best[2]
+
+    def hopeless(self, chance: float) -> bool:
+        """Whether a chance is too small to go on."""
+        return len(self.trials) > 1 and chance < _HOPELESS
+
+    def binding(self) -> str:
+        """The limit without which the rest of the budget would be met most easily."""
+        if len(self.limits) == 1:
+            return next(iter(self.limits))
+        gains = {}
+        for name in self.limits:
+            rest = {other: limit for other, limit in self.limits.items() if other != name}
+            gains[name] = replace(self, limits=rest).next()[1]
+        return max(gains, key=lambda name: gains[name])
+
+    def guesses(self, plan: Plan) -> dict[str, Guess]:
+        """What is expected of a plan: as measured where its place was tried, else by the laws."""
+        return self._guesses(self._of_place(plan.place), plan.bases, plan.precision)
+
+    def _of_place(self, place: Place) -> tuple[Trial, bool, dict[str, Guess], dict[str, float]]:
+        """The trial to tell a place from, whether it is that very place's, the laws there, and how far they moved from it."""
+        known = next((trial for trial in reversed(self.trials) if trial.place == place), None)
+        trial, row = known or self.trials[-1], self._row(place)
+        laws = {name: law.at(row) for name, law in self._laws.items()}
+        there = self._row(trial.place)
+        return trial, known is not None, laws, {name: laws[name].mean - law.at(there).mean for name, law in self._laws.items()}
+
+    def _guesses(
+        self, told: tuple[Trial, bool, dict[str, Guess], dict[str, float]], bases: int, precision: str
+    ) -> dict[str, Guess]:
+        trial, known, laws, moved = told
+        error, spread = _between(trial.bases, trial.errors, bases), trial.error_spread
+        if not known:
+            # What is left at the most bases is the rest; what fewer add to it is truncation, the same wherever it is looked at.
+            truncation, rest = max(error**2 - min(trial.errors) ** 2, 0.0), np.exp(2 * laws["rest"].mean)
+            error = float(np.sqrt(truncation + rest))
+            spread = float(np.hypot(spread, rest / error**2 * laws["rest"].spread))
+        found = {"relative_rmse": Guess(log(max(error, _TINY)), max(spread, 1e-3))}
+        for name, curve in (("frame_us", trial.frame_us), ("megabytes", trial.megabytes[precision])):
+            certain = known and bases in trial.bases
+            found[name] = Guess(
+                log(_between(trial.bases, curve, bases)) + moved[name], _AGAIN if certain else laws[name].spread
+            )
+        for name in ("bake_seconds", "fit_seconds"):
+            found[name] = Guess(log(getattr(trial, name)), _AGAIN) if known else laws[name]
+        return found
+
+    def _row(self, place: Place) -> np.ndarray:
+        return np.concatenate([[1.0], np.log(np.array(place) / np.array(self.base))])
+
+
+def _told(name: str, trial: Trial) -> float:
+    """What a trial says to a law: curves over the bases speak through their middle."""
+    if name == "rest":
+        return min(trial.errors)
+    if name == "frame_us":
+        return float(np.exp(np.mean(np.log(trial.frame_us))))
+    if name == "megabytes":
+        return float(np.exp(np.mean(np.log(next(iter(trial.megabytes.values()))))))
+    return float(getattr(trial, name))
+
+
+def _between(bases: Sequence[int], values: Sequence[float], wanted: int) -> float:
+    """A curve over the number of bases at a number between, straight in logarithms."""
+    return float(np.exp(np.interp(np.log(wanted), np.log(bases), np.log(np.maximum(values, _TINY)))))

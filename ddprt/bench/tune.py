@@ -1,0 +1,315 @@
+"""`ddprt tune`: the setting that meets a budget, found by few trials, and a configuration that makes it again."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ddprt.bench.planner import KNOBS, QUANTITIES, Place, Plan, Planner, Trial
+from ddprt.bench.settings import Setting, changed
+from ddprt.bench.timing import timed
+from ddprt.bench.trial import Workshop, about, environment
+from ddprt.config import Config
+from ddprt.dataset.forecast import forecast
+from ddprt.dataset.store import Dataset
+from ddprt.errors import UserError
+from ddprt.files import alone_in, append_line, make_folder, write_text
+from ddprt.methods.svd_ridge import LinearTransfer
+from ddprt.report.metrics import Tally
+from ddprt.runtime.model import Model
+from ddprt.runtime.precision import shipped_bytes, stored
+from ddprt.runtime.train import fit_config
+
+BASES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
+_SCORED = (1, 2, 4, 8, 16, 32, 64, 128)
+_PRECISIONS = ("half", "float")
+_FACTORS: dict[str, tuple[float, ...]] = {
+    "atlas.resolution": (0.25, 0.5, 2**-0.5, 1),
+    "lightings.train": (0.125, 0.25, 0.5, 1, 2),
+    "transport.target_noise": (0.5, 1, 2, 4, 8),
+    "points.count": (0.5, 1, 2, 4),
+}
+_LEAST = {"atlas.resolution": 16, "lightings.train": 4, "transport.target_noise": 1e-3, "points.count": 4}
+_SURE = 0.9
+_FRAMES = 50  # timings of a frame
+UNITS = {"relative_rmse": "", "frame_us": " µs", "megabytes": " MB", "bake_seconds": " s", "fit_seconds": " s"}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a search.
+
+    Attributes:
+      plan: the best that was tried.
+      reached: each of `QUANTITIES`, as measured.
+      chance: that lightings of another seed are within the limits, too.
+      met: whether the budget is met.
+      binding: the limit that stands in the way, or that was met with the least room.
+      trials: bakes that were made.
+      setting: the plan as a configuration.
+      limits: what was asked for.
+    """
+
+    plan: Plan
+    reached: dict[str, float]
+    chance: float
+    met: bool
+    binding: str
+    trials: int
+    setting: Setting
+    limits: dict[str, float]
+
+
+class Search:
+    """Trials until the budget is met, is out of reach, or `tune.trials` are used up.
+
+    Args:
+      config: the base, with its [tune] section.
+      workshop: where settings are tried.
+    Raises:
+      UserError: no limit is set, or another method than svd-ridge is to be tuned.
+    """
+
+    def __init__(self, config: Config, workshop: Workshop) -> None:
+        limits = {name: getattr(config.tune, f"max_{name}") for name in QUANTITIES}
+        self.limits = {name: limit for name, limit in limits.items() if limit > 0}
+        if not self.limits:
+            raise UserError(
+                "ddprt tune: got no limit, expected at least one of "
+                + ", ".join(f"--max-{name.replace('_', '-')}" for name in QUANTITIES)
+                + "; give one"
+            )
+        if config.fit.method != "svd-ridge":
+            raise UserError(f'fit.method: got "{config.fit.method}", expected "svd-ridge"; the planner counts its bases')
+        self.config, self.workshop = config, workshop
+        self.base: Place = tuple(float(_value(config, knob)) for knob in KNOBS)
+        values = [_around(config, knob, base) for knob, base in zip(KNOBS, self.base, strict=True)]
+        self.planner = Planner(self.base, values, BASES, _PRECISIONS, self.limits)
+
+    def run(self) -> Outcome:
+        """Searches."""
+        progress, planner = self.workshop.progress, self.planner
+        self._try(self._start())
+        verified: dict[Plan, dict[str, float]] = {}
+        while True:
+            plan, chance = planner.next()
+            tried = any(trial.place == plan.place for trial in planner.trials)
+            if tried and plan in verified:
+                break
+            if tried:
+                verified[plan] = self._verify(plan)
+                continue
+            if planner.hopeless(chance) or len(planner.trials) >= self.config.tune.trials:
+                break
+            progress.say(f"next: {self._setting(plan).name}, a chance of {chance:.0%}")
+            self._try(plan.place)
+        if not verified:  # the best plan lies where no trial may be made any more
+            plan = self._best_tried()
+            verified[plan] = self._verify(plan)
+        plan = max(verified, key=lambda each: (self._chance(each), -verified[each]["relative_rmse"]))
+        reached, chance = verified[plan], self._chance(plan)
+        room = {name: limit / reached[name] for name, limit in self.limits.items()}
+        met = min(room.values()) >= 1
+        binding = min(room, key=lambda name: room[name]) if met else planner.binding()
+        return Outcome(plan, reached, chance, met, binding, len(planner.trials), self._setting(plan), self.limits)
+
+    def _start(self) -> Place:
+        """The base, or a coarser place where a forecast says that baking the base alone takes several budgets."""
+        limit = self.limits.get("bake_seconds")
+        if limit is None:
+            return self.base
+        expected = forecast(self.workshop.scene, self.config, self.workshop.progress).training_seconds
+        place = self.base
+        for knob, step in ((2, 1), (1, -1), (0, -1)) * 4:
+            if expected <= 2 * limit:
+                break
+            ladder = sorted(self.planner.values[knob])
+            at = ladder.index(place[knob]) + step
+            if 0 <= at < len(ladder):
+                factor = ladder[at] / place[knob]
+                expected *= factor ** (-0.8, 0.6, 1.5)[(2, 1, 0).index(knob)]
+                place = (*place[:knob], ladder[at], *place[knob + 1 :])
+        return place
+
+    def _try(self, place: Place) -> None:
+        """Bakes at a place, and scores all numbers of bases."""
+        setting = self._setting(Plan(place, max(BASES), "float"))
+        with self.workshop.progress.stage(f"trial {len(self.planner.trials) + 1}: {setting.name}") as stage:
+            data, baked = self.workshop.bake(setting)
+            model, fitted = self._fit(setting, data)
+            sizes = [count for count in _SCORED if count < model.relighter.report.bases] + [model.relighter.report.bases]
+            shorter = [first_bases(model, count) for count in sizes]
+            tallies = [self.workshop.yardstick.tally(stored(one, "half")) for one in shorter]
+            errors = [_error(tally) for tally in tallies]
+            values = data.values(data.split("train")[:1], model.points, model.quantity)[0]
+            trial = Trial(
+                place,
+                tuple(sizes),
+                tuple(errors),
+                spread_of(tallies[-1]),
+                tuple(_frame_us(one, values) for one in shorter),
+                {name: tuple(shipped_bytes(one, name) / 1e6 for one in shorter) for name in _PRECISIONS},
+                baked["seconds"],
+                fitted,
+            )
+            stage.facts["error"] = f"{errors[-1]:.4g} at {sizes[-1]} bases"
+        self.planner.add(trial)
+        record = {**about(setting), "trial": asdict(trial), "bake": baked, "environment": environment()}
+        append_line(self.workshop.folder / "trials.jsonl", json.dumps(record, allow_nan=False))
+
+    def _verify(self, plan: Plan) -> dict[str, float]:
+        """The plan itself, fitted and scored; the trial of its place takes over what differs from its curves."""
+        setting = self._setting(plan)
+        data, baked = self.workshop.bake(setting)
+        model, fitted = self._fit(setting, data)
+        model = stored(model, plan.precision)
+        values = data.values(data.split("train")[:1], model.points, model.quantity)[0]
+        tally = self.workshop.yardstick.tally(model)
+        reached = {
+            "relative_rmse": _error(tally),
+            "frame_us": _frame_us(model, values),
+            "megabytes": shipped_bytes(model, plan.precision) / 1e6,
+            "bake_seconds": float(baked["seconds"]),
+            "fit_seconds": fitted,
+        }
+        known = next(trial for trial in reversed(self.planner.trials) if trial.place == plan.place)
+        self.planner.trials.remove(known)
+        self.planner.add(with_measured(known, plan, reached, spread_of(tally)))
+        return reached
+
+    def _fit(self, setting: Setting, data: Dataset) -> tuple[Model, float]:
+        model, timing = timed(lambda: fit_config(data, setting.config, "svd-ridge"), 1)
+        return model, timing.median
+
+    def _setting(self, plan: Plan) -> Setting:
+        changes: dict[str, Any] = {
+            knob: value if knob == "transport.target_noise" else round(value)
+            for knob, value, base in zip(KNOBS, plan.place, self.base, strict=True)
+            if value != base
+        }
+        changes |= {"fit.bases": plan.bases, "export.precision": plan.precision}
+        return Setting(changes, changed(self.config, changes))
+
+    def _chance(self, plan: Plan) -> float:
+        guesses = self.planner.guesses(plan)
+        return float(np.exp(sum(guesses[name].chance(limit) for name, limit in self.limits.items())))
+
+    def _best_tried(self) -> Plan:
+        places = [trial.place for trial in self.planner.trials]
+        plans = [Plan(*parts) for parts in product(places, BASES, _PRECISIONS)]
+        return max(plans, key=self._chance)
+
+
+def tune(config: Config, folder: Path, progress: Any) -> Outcome:
+    """Finds a setting within the limits of [tune], and writes it down as `tuned.toml` (or `nearest.toml`).
+
+    Args:
+      config: the base; its knobs are turned about where they stand, the resolution never above.
+      folder: for trials and their datasets, which go when the search is over.
+      progress: shown while working.
+    Raises:
+      UserError: no limit, or whatever hinders a bake.
+    """
+    make_folder(folder)
+    with alone_in(folder):
+        workshop = Workshop(config, folder, progress)
+        (folder / "trials.jsonl").unlink(missing_ok=True)
+        outcome = Search(config, workshop).run()
+        for name in ("tuned.toml", "nearest.toml"):
+            (folder / name).unlink(missing_ok=True)
+        write_text(folder / ("tuned.toml" if outcome.met else "nearest.toml"), outcome.setting.config.to_toml())
+        if not config.bench.keep:
+            workshop.forget_all()
+    return outcome
+
+
+def first_bases(model: Model, count: int) -> Model:
+    """The model with its first bases alone; a mean counts as one of them."""
+    linear = model.relighter
+    assert isinstance(linear, LinearTransfer), "the planner fits svd-ridge"
+    report = linear.report
+    kept = count - (report.bases - len(linear.basis))
+    shorter = replace(linear, matrix=linear.matrix[:, :kept], intercept=linear.intercept[:, :kept], basis=linear.basis[:kept])
+    return replace(model, relighter=replace(shorter, report=replace(report, bases=count)))
+
+
+def spread_of(tally: Tally) -> float:
+    """Standard error of the logarithm of the relative RMSE over held-out lightings, by leaving each out (the jackknife)."""
+    count = len(tally.error)
+    if count < 2 or not tally.error.any():
+        return 1.0
+    means = tally.mean.mean(1)
+    others = (tally.error.sum() - tally.error) / (count - 1), (means.sum() - means) / (count - 1)
+    logs = 0.5 * np.log(np.maximum(others[0], 1e-300)) - np.log(np.maximum(others[1], 1e-300))
+    return float(np.sqrt((count - 1) / count * np.sum((logs - logs.mean()) ** 2)))
+
+
+def with_measured(trial: Trial, plan: Plan, reached: dict[str, float], spread: float) -> Trial:
+    """A trial with one more number of bases on its curves, or with another value there."""
+    rows = {
+        bases: (error, frame, {name: sizes[i] for name, sizes in trial.megabytes.items()})
+        for i, (bases, error, frame) in enumerate(zip(trial.bases, trial.errors, trial.frame_us, strict=True))
+    }
+    between = {name: float(np.interp(plan.bases, trial.bases, sizes)) for name, sizes in trial.megabytes.items()}
+    rows[plan.bases] = reached["relative_rmse"], reached["frame_us"], {**between, plan.precision: reached["megabytes"]}
+    order: Sequence[int] = sorted(rows)
+    return replace(
+        trial,
+        bases=tuple(order),
+        errors=tuple(rows[bases][0] for bases in order),
+        error_spread=spread,
+        frame_us=tuple(rows[bases][1] for bases in order),
+        megabytes={name: tuple(rows[bases][2][name] for bases in order) for name in trial.megabytes},
+        fit_seconds=reached["fit_seconds"],
+    )
+
+
+def told(outcome: Outcome) -> str:
+    """The trade that was made, as a table and a sentence."""
+    lines = [f"{'':<16}{'reached':>12}{'limit':>12}"]
+    for name in QUANTITIES:
+        limit = f"{outcome.limits[name]:.4g}{UNITS[name]}" if name in outcome.limits else "-"
+        lines.append(f"{name:<16}{f'{outcome.reached[name]:.4g}{UNITS[name]}':>12}{limit:>12}")
+    setting = f"{outcome.setting.name}, after {outcome.trials} bakes"
+    if outcome.met:
+        lines.append(f"meets the budget: {setting}; the least room is left by {outcome.binding}")
+        if outcome.chance < _SURE:
+            lines.append(f"just so: other lightings may be beyond it (a chance of {outcome.chance:.0%} that they are not)")
+    else:
+        lines.append(f"no setting meets the budget; {outcome.binding} stands in the way; nearest: {setting}")
+    return "\n".join(lines)
+
+
+def _value(config: Config, knob: str) -> float:
+    section, key = knob.split(".")
+    return float(getattr(getattr(config, section), key))
+
+
+def _around(config: Config, knob: str, base: float) -> tuple[float, ...]:
+    """What a knob may be; alone what it is where it has no effect."""
+    still = (knob == "transport.target_noise" and config.transport.samples != "auto") or (
+        knob == "points.count" and bool(config.points.file)
+    )
+    if still or (knob == "lightings.train" and config.lightings.file):
+        return (base,)
+    steps = {max(_LEAST[knob], factor * base) for factor in _FACTORS[knob]}
+    if knob == "transport.target_noise":
+        return tuple(sorted(min(1.0, float(f"{step:.3g}")) for step in steps))
+    if knob == "atlas.resolution":
+        return tuple(sorted({base, *(float(8 * round(step / 8)) for step in steps)}))
+    return tuple(sorted({base, *(float(round(step)) for step in steps)}))
+
+
+def _error(tally: Tally) -> float:
+    error = tally.scores()["relative_rmse"]
+    if error is None:
+        raise UserError("tune: got held-out lightings without indirect light, expected some; there is nothing to learn")
+    return float(error)
+
+
+def _frame_us(model: Model, values: np.ndarray) -> float:
+    return 1e6 * timed(lambda: model.predict(values), _FRAMES)[1].median

@@ -1,0 +1,144 @@
+"""A bake's own code on a share of its work: what `forecast` measures, and the laws by which it grows."""
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from ddprt.config import Config
+from ddprt.dataset.store import Manifest
+from ddprt.lights import Lighting
+from ddprt.machine import peak_memory_gib
+from ddprt.progress import Progress
+from ddprt.scene.atlas import Atlas
+from ddprt.scene.mesh import Scene
+from ddprt.transport.embree import Tracer
+
+PATIENCE = 0.7  # seconds after which no further sample of a kind is taken
+
+Number = float | int
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What is expected of a stage; `name` as in run.json, or "files": all that lies between stages."""
+
+    name: str
+    seconds: float
+    rays: int = 0
+    files: int = 0
+    bytes: int = 0
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a bake that a setting could shorten.
+
+    Attributes:
+      what: in words: "gather rays for held-out maps".
+      seconds: that it takes.
+      setting: what to set instead: "transport.target_noise = 0.02".
+      then: seconds that it would take so.
+    """
+
+    what: str
+    seconds: float
+    setting: str
+    then: float
+
+
+def extrapolated(spent: Sequence[tuple[Number, Number]], whole: Number) -> float:
+    """Seconds of work from rounds of it: the first, which also loads and compiles, and the rate of all others.
+
+    Args:
+      spent: amount of work and seconds of each round, in order.
+      whole: amount of the whole, these rounds included.
+    """
+    (first, cold), *others = spent
+    done = sum(size for size, _ in others)
+    rate = sum(seconds for _, seconds in others) / done if done else cold / first
+    return float(cold + (whole - first) * rate)
+
+
+def on_a_line(one: tuple[Number, Number], other: tuple[Number, Number], at: Number) -> float:
+    """What a constant and something for each come to, from two measurements of (number, seconds); numbers cost, at least 0."""
+    (few, low), (many, high) = one, other
+    return float(high + (at - many) * max(high - low, 0.0) / (many - few) if many > few else high * at / many)
+
+
+@dataclass
+class Sampled:
+    """One bake, of which a share is done in a folder that will go.
+
+    Attributes:
+      bounces: of the plan.
+      peak: GiB at the highest so far.
+    """
+
+    scene: Scene
+    config: Config
+    folder: Path
+    progress: Progress
+    tracer: Tracer
+    lightings: Sequence[Lighting]
+    bounces: int
+    atlas: Atlas
+    manifest: Manifest
+    peak: float
+
+    def each(
+        self,
+        work: Callable[[Item], Result],
+        items: Sequence[Item],
+        whole: Number,
+        size: Callable[[Item], Number] = lambda item: 1.0,
+        names: Callable[[Item], Sequence[str]] = lambda item: (),
+        least: int = 0,
+    ) -> tuple[float, list[Result]]:
+        """Works on as many items as patience allows; two rounds at least, if there are as many.
+
+        Args:
+          work: what the bake does with one.
+          items: in an order of which any beginning stands for all.
+          whole: work of the bake, in the unit of `size`.
+          size: work of an item.
+          names: files that are then named in the manifest.
+          least: items that are done however long they take.
+        Returns:
+          Seconds of the whole, and what was done.
+        """
+        results: list[Result] = []
+        spent: list[tuple[Number, Number]] = []
+        step = self.tracer.threads
+        while len(results) < len(items) and (
+            len(spent) < 2 or len(results) < least or sum(seconds for _, seconds in spent) < PATIENCE
+        ):
+            chunk = items[len(results) : len(results) + step]
+            begun = time.perf_counter()
+            for item, result in zip(chunk, self.tracer.map(work, chunk), strict=True):
+                for name in names(item):
+                    self.manifest.add(name)
+                results.append(result)
+            spent.append((sum(map(size, chunk)), time.perf_counter() - begun))
+            step = 4 * self.tracer.threads  # the ends of rounds, where threads wait for each other, must not count for much
+        return extrapolated(spent, whole), results
+
+    def size(self, names: Sequence[str]) -> int:
+        """Bytes of files that the manifest names."""
+        return sum(self.manifest.entries[name]["bytes"] for name in names)
+
+    def holds(self, *sizes: Number) -> None:
+        """So many bytes are needed beside what is held now."""
+        self.peak = max(self.peak, resident() + sum(sizes) / 2**30)
+
+
+def resident() -> float:
+    """GiB that this process holds in memory; at the highest where the system does not tell what it holds now."""
+    with suppress(OSError):
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS:")) / 2**20
+    return peak_memory_gib() or 0.0

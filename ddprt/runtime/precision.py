@@ -1,0 +1,91 @@
+"""What is left of a model once it is stored in few bits, and how many bytes that takes."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ddprt.catalogue import Catalogue
+from ddprt.methods.svd_ridge import LinearTransfer
+from ddprt.runtime.model import Model
+
+Rounding = Callable[[Float[np.ndarray, "*n"]], Float[np.ndarray, "*n"]]
+
+
+def _half(values: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    return values.astype(np.float16).astype(np.float32)
+
+
+def _byte(values: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Signed normalised integers, as textures of 8 bits a channel hold them."""
+    return (np.rint(127 * np.clip(values, -1, 1)) / 127).astype(np.float32)
+
+
+PRECISIONS: Catalogue[tuple[int, Rounding]] = Catalogue(
+    "precision", {"float": (4, lambda values: values.astype(np.float32)), "half": (2, _half), "byte": (1, _byte)}
+)
+"""Bytes of a number, and the rounding of numbers between -1 and 1."""
+
+
+def stored(model: Model, precision: str) -> Model:
+    """The model as it comes back from its stored form.
+
+    Of svd-ridge the basis and the mean are stored so, each map scaled to a largest magnitude of 1 (the mean in halves as it is,
+    as `ddprt.export.textures` writes it), while matrices and scales stay float32. Of other methods every array is, each row of
+    its first axis scaled likewise.
+
+    Args:
+      model: as it was fitted.
+      precision: entry of `PRECISIONS`; "float" changes nothing.
+    Raises:
+      UserError: no such precision.
+    """
+    _, rounding = PRECISIONS[precision]
+    if precision == "float":
+        return model
+    relighter = model.relighter
+    if isinstance(relighter, LinearTransfer):
+        mean = np.asarray(relighter.mean, np.float32)
+        kept = _half(mean) if precision == "half" else _by_rows(mean[None], rounding)[0]
+        basis = _by_rows(np.asarray(relighter.basis, np.float32), rounding)
+        return replace(model, relighter=replace(relighter, basis=jnp.asarray(basis), mean=jnp.asarray(kept)))
+    rounded = jax.tree.map(lambda leaf: jnp.asarray(_leaf(np.asarray(leaf), rounding)), relighter)
+    return replace(model, relighter=replace(rounded, report=relighter.report))
+
+
+def shipped_bytes(model: Model, precision: str) -> int:
+    """Bytes of the arrays that an engine needs to relight: maps over covered texels and matrices, in that precision.
+
+    Scales of the maps are counted, points are not; padding of textures (texels that nothing covers, channels that fill up a
+    layer) is not either, so that "float" gives `Relighter.nbytes` and a scale for each map.
+
+    Raises:
+      UserError: no such precision.
+    """
+    size, _ = PRECISIONS[precision]
+    relighter = model.relighter
+    if isinstance(relighter, LinearTransfer):
+        has_mean = bool(np.any(relighter.mean))
+        maps = relighter.basis.size + (relighter.mean.size if has_mean else 0)
+        rest = relighter.matrix.size + relighter.offset.size + relighter.intercept.size
+        return int(size * maps + 4 * (rest + len(relighter.basis)))
+    leaves = [leaf for leaf in jax.tree.leaves(relighter) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    scales = 0 if precision == "float" else sum(len(leaf) if leaf.ndim > 1 else 1 for leaf in leaves)
+    return int(relighter.nbytes - sum((leaf.dtype.itemsize - size) * leaf.size for leaf in leaves) + 4 * scales)
+
+
+def _leaf(leaf: np.ndarray, rounding: Rounding) -> np.ndarray:
+    if not np.issubdtype(leaf.dtype, np.floating) or leaf.size == 0:
+        return leaf
+    rows = leaf.reshape(len(leaf) if leaf.ndim > 1 else 1, -1)
+    return _by_rows(rows, rounding).reshape(leaf.shape)
+
+
+def _by_rows(rows: Float[np.ndarray, "rows entries"], rounding: Rounding) -> Float[np.ndarray, "rows entries"]:
+    """Rounded in units of the largest magnitude of each row; rows of zeros stay."""
+    largest = np.abs(rows).max(1, initial=0, keepdims=True)
+    scale = np.where(largest > 0, largest, 1)
+    return rounding(rows / scale) * scale

@@ -1,0 +1,312 @@
+"""The budget of error: an identity on real bakes, and each part moved by its own cause and by no other.
+
+All budgets of this file share their bakes next to free of noise, so that what does not depend on a setting is the same bits.
+"""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ddprt.bench.advice import record, turn, weigh_knobs
+from ddprt.bench.best_fit import best_transfer, projected
+from ddprt.bench.budget import CAUSES, Budget, measure_budget, table
+from ddprt.bench.chain import Link, squared_error, take_apart
+from ddprt.bench.yardsticks import Bakery
+from ddprt.config import load_config
+from ddprt.errors import UserError
+from ddprt.export.textures import LAYER, export_textures
+from ddprt.pipeline import Run
+from ddprt.runtime.model import Model
+from ddprt.runtime.precision import PRECISIONS, shipped_bytes, stored
+from ddprt.scene.exr import read_exr
+
+SMALL = {
+    "atlas.resolution": "32",
+    "lightings.train": "24",
+    "lightings.validation": "3",
+    "lightings.test": "2",
+    "lightings.region_low": "[0.1, 0.5, 0.1]",
+    "lightings.region_high": "[0.9, 0.8, 0.9]",
+    "points.count": "24",
+    "points.supersample": "4",
+    "transport.samples": "256",
+    "transport.test_samples": "16",
+    "transport.threads": "2",
+    "fit.bases": "6",
+    "methods.compare": "[]",
+    "budget.lightings": "12",
+    "budget.noise": "0.02",
+    "budget.abundance": "3",
+    "budget.truth_samples": "1024",
+    "budget.shadow_map": "256",
+}
+NOTHING_BUT = {  # what a setting of the shipped model or its fit may move beside its own part
+    "noise": {"clamp", "runtime mismatch", "quantisation", "noise"},
+    "quantisation": {"clamp", "runtime mismatch", "quantisation"},
+    "runtime mismatch": {"clamp", "runtime mismatch"},
+}
+LOW_LAMPS = {"region_low": [0.1, 0.05, 0.1], "region_high": [0.9, 0.3, 0.9]}
+
+
+class Workshop:
+    """Runs and budgets of this file, each made once."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.made: dict[str, tuple[Budget, Model, Bakery]] = {}
+
+    def __call__(self, **settings: Any) -> tuple[Budget, Model, Bakery]:
+        overrides = SMALL | {key.replace("__", "."): str(value) for key, value in settings.items()}
+        key = json.dumps(overrides, sort_keys=True)
+        if key not in self.made:
+            config = load_config(None, overrides)
+            baked = config.digest("atlas", "lightings", "points", "transport")
+            run = Run(config, self.folder / baked, quiet=True)
+            data = run.bake()
+            model = run.fit(data)[0][config.fit.method]
+            bakery = Bakery(run.scene, config, data, self.folder / "budget", run.progress)
+            self.made[key] = measure_budget(model, bakery), model, bakery
+        return self.made[key]
+
+
+@pytest.fixture(scope="module")
+def workshop(tmp_path_factory: pytest.TempPathFactory) -> Workshop:
+    return Workshop(tmp_path_factory.mktemp("budget"))
+
+
+def squares(budget: Budget) -> dict[str, float]:
+    return {cause: budget.parts.part(cause) for cause in budget.parts.causes}
+
+
+def moved(before: Budget, after: Budget) -> set[str]:
+    """Parts that are not the same bits."""
+    one, other = squares(before), squares(after)
+    return {cause for cause in one if one[cause] != other[cause]}
+
+
+def test_parts_and_cross_terms_are_the_error(workshop: Workshop) -> None:
+    budget, model, bakery = workshop()
+    from ddprt.bench.budget import engine_values
+
+    engine, _ = engine_values(model, budget.lightings, bakery.config.budget)
+    ships = np.maximum(stored(model, "half").predict(engine, clamp=False), 0).astype(np.float64)
+    one, other = (ships - half.astype(np.float64) for half in budget.truth)
+    area = bakery.data.area
+    mean = sum(float((half.astype(np.float64) * area[:, None]).sum()) for half in budget.truth) / 2
+    mean /= area.sum() * 3 * len(ships)
+    total = float((one * other * area[:, None]).sum() / area.sum() / (3 * len(ships))) / mean**2
+    document = budget.parts.record()
+    assert tuple(budget.parts.causes) == tuple(cause for cause in CAUSES if cause != "the rest")
+    # Sums of some 1e5 products in float64, of which the terms may be a hundred times their sum.
+    assert document["total"]["relative_square"] == pytest.approx(total, rel=1e-10)
+    shares = [part["share"] for part in document["parts"]] + [pair["share"] for pair in document["cross_terms"]]
+    assert sum(shares) == pytest.approx(1, abs=1e-10)
+    assert document["closure"] == pytest.approx(sum(part["share"] for part in document["parts"]), abs=1e-12)
+    assert abs(document["closure"] - 1) < 0.05  # what is asked for; the chain's order is there for it
+    assert budget.chance < 0.05
+
+
+def test_noise_of_the_truth_is_in_no_part(workshop: Workshop) -> None:
+    """A field that is the truth itself has a squared error of 0, although its halves are noisy."""
+    budget, _, _ = workshop()
+    mean = (budget.truth[0] + budget.truth[1]) / 2
+    noisy = float(np.einsum("ltc,t->", (mean - budget.truth[0]).astype(np.float64) ** 2, budget.weight)) / (3 * len(mean))
+    # The mean shares each half's noise: <m - a, m - b> = -||a - b||² / 4, whose sign tells that it is no square.
+    assert squared_error(mean, budget.truth, budget.weight) == pytest.approx(-noisy, rel=1e-3)  # float32 means
+    rng = np.random.default_rng(0)
+    light = rng.uniform(1, 2, (8, 4000, 3)).astype(np.float32)
+    one, other = (light + rng.normal(0, 0.5, light.shape).astype(np.float32) for _ in range(2))
+    weight = np.full(4000, 1 / 4000)
+    # Noise of variance 0.25 in either half: their product's mean over 96000 values is 0 to 0.25 / sqrt(96000).
+    assert abs(squared_error(light, (one, other), weight)) < 5 * 0.25 / np.sqrt(light.size)
+
+
+def test_projection_is_orthogonal_to_its_span(workshop: Workshop) -> None:
+    budget, _, _ = workshop()
+    causes, products = budget.parts.causes, budget.parts.products
+    last = causes.index("truncation")
+    for cause in ("regularisation", "measurement"):
+        i = causes.index(cause)
+        # Fields are rounded to float32 where they are decoded: relative to the light, not to the steps.
+        assert abs(products[i, last]) < 1e-5 * np.sqrt(products[i, i] * products[last, last])
+
+
+def test_noise_reacts_to_noisy_maps_alone(workshop: Workshop) -> None:
+    plain, noisy = workshop()[0], workshop(transport__samples=8)[0]
+    assert noisy.parts.part("noise") > 4 * plain.parts.part("noise")
+    assert moved(plain, noisy) <= NOTHING_BUT["noise"]
+
+
+def test_truncation_reacts_to_fewer_bases(workshop: Workshop) -> None:
+    plain, fewer = workshop()[0], workshop(fit__bases=3)[0]
+    assert fewer.parts.part("truncation") > 1.5 * plain.parts.part("truncation")
+    assert fewer.parts.part("operator bias") == plain.parts.part("operator bias")
+
+
+def test_quantisation_reacts_to_fewer_bits(workshop: Workshop, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain, exact = workshop()[0], workshop(export__precision="float")[0]
+    assert exact.parts.part("quantisation") == 0 < plain.parts.part("quantisation")
+    assert moved(plain, exact) <= NOTHING_BUT["quantisation"]
+    monkeypatch.setitem(PRECISIONS, "half", (1, lambda values: (np.rint(7 * values) / 7).astype(np.float32)))
+    _, model, bakery = workshop()
+    crude = measure_budget(model, bakery)
+    assert crude.parts.part("quantisation") > 1e4 * plain.parts.part("quantisation")  # 7 levels for 1024: 2e4 times the square
+    assert moved(plain, crude) <= NOTHING_BUT["quantisation"]
+
+
+def test_mismatch_reacts_to_the_shadow_map(workshop: Workshop) -> None:
+    plain, coarse = workshop()[0], workshop(budget__shadow_map=8)[0]
+    assert coarse.parts.part("runtime mismatch") > 4 * plain.parts.part("runtime mismatch")
+    assert moved(plain, coarse) <= NOTHING_BUT["runtime mismatch"]
+
+
+def test_regularisation_reacts_to_the_ridge(workshop: Workshop) -> None:
+    plain, damped = workshop()[0], workshop(fit__ridge=3.0)[0]
+    assert damped.parts.part("regularisation") > 2 * plain.parts.part("regularisation")
+    same = {"scenario shift", "measurement", "truncation", "operator bias"}
+    assert not moved(plain, damped) & same  # the basis does not know the ridge
+
+
+@pytest.mark.slow
+def test_scenario_shift_is_there_with_a_scenario_alone(workshop: Workshop) -> None:
+    plain = workshop()[0]
+    shifted = workshop(budget__scenario=json.dumps(LOW_LAMPS).replace(":", " ="))[0]
+    assert plain.parts.part("scenario shift") == 0
+    assert not plain.parts.products[plain.parts.causes.index("scenario shift")].any()
+    assert shifted.parts.part("scenario shift") > 0.05 * shifted.parts.squared
+    lamps = np.array([lighting[0].anchor() for lighting in shifted.lightings])
+    low, high = shifted.clean.occluders.reshape(-1, 3).min(0), shifted.clean.occluders.reshape(-1, 3).max(0)
+    assert (lamps[:, 1] < low[1] + 0.3 * (high - low)[1]).all()
+
+
+@pytest.mark.slow
+def test_other_spaces_and_methods(workshop: Workshop) -> None:
+    bent = workshop(fit__space="gamma", fit__centre="mean", fit__channels="multi")[0]
+    document = bent.parts.record()
+    shares = [part["share"] for part in document["parts"]] + [pair["share"] for pair in document["cross_terms"]]
+    assert sum(shares) == pytest.approx(1, abs=1e-10)
+    assert 0.5 < document["closure"] < 1.5  # orthogonal in the encoded space only: told, and not bounded by any law
+    budget, model, bakery = workshop(fit__method="nearest")
+    assert budget.parts.causes == (
+        "clamp", "runtime mismatch", "quantisation", "noise", "scenario shift", "the rest", "operator bias"
+    )  # fmt: skip
+    assert max(squares(budget), key=lambda cause: squares(budget)[cause]) == "the rest"
+    assert {knob.cause for knob in weigh_knobs(budget, model, bakery)} <= set(budget.parts.causes)
+
+
+def test_projection_and_best_transfer_are_the_best(workshop: Workshop) -> None:
+    """No other coefficients come nearer to a field, and no other transfer to the lightings that it is fitted on."""
+    budget = workshop()[0]
+    model, data = budget.clean, budget.yardsticks.clean
+    shown = projected(model, budget.values, budget.own[0])
+    light = (budget.own[0], budget.own[0])
+    least = squared_error(shown, light, budget.weight)
+    again = projected(model, budget.values, shown)
+    np.testing.assert_allclose(again, shown, atol=1e-5 * shown.max())  # of a projection nothing is left; float32 bases
+    basis = np.asarray(model.relighter.basis)  # type: ignore[attr-defined]
+    for vector in basis:
+        nudge = 0.01 * shown.std() * np.repeat(vector[:, None], 3, 1)[None].astype(np.float32)
+        assert squared_error(shown + nudge, light, budget.weight) > least
+    train = data.split("train")
+    best, values = best_transfer(model, data, train), data.values(train, model.points, model.quantity)
+    trained = data.maps("indirect", train)
+    error = squared_error(best.predict(values, clamp=False), (trained, trained), budget.weight)
+    assert error < squared_error(model.predict(values, clamp=False), (trained, trained), budget.weight)
+
+
+def test_the_first_knob_does_what_is_said(workshop: Workshop) -> None:
+    budget, model, bakery = workshop()
+    document = record(budget, model, bakery)
+    assert document["schema"] == 1
+    assert json.loads(json.dumps(document, allow_nan=False))
+    first, done = document["predicted"][0], document["measured"]
+    assert first["relative_rmse"] == min(knob["relative_rmse"] for knob in document["predicted"])
+    gain, found = (document["now"]["relative_rmse"] - after["relative_rmse"] for after in (first, done))
+    assert found > 0
+    assert gain == pytest.approx(found, rel=0.5)  # a prediction that is out by more than half is none
+    assert (first["bytes"], first["flops"]) == (done["bytes"], done["flops"])
+    assert first["setting"] in document["advice"]
+    assert f"{done['relative_rmse']:.2%}" in document["advice"]
+    assert all(cause in table(document) for cause in budget.parts.causes)
+    assert "exactly 0" in table(document)
+
+
+def test_knobs_that_bake(workshop: Workshop) -> None:
+    budget, _, bakery = workshop(transport__samples=8)
+    knobs = {knob.cause: knob for knob in weigh_knobs(budget, *workshop(transport__samples=8)[1:])}
+    done = turn(knobs["noise"], budget, bakery)
+    assert knobs["noise"].setting == "transport.samples"
+    assert knobs["noise"].then == 32
+    assert done.relative_rmse < np.sqrt(budget.parts.squared)
+    assert done.bake_seconds is not None
+    assert turn(knobs["noise"], budget, bakery).bake_seconds is None
+
+
+def test_lightings_of_a_file_are_refused(workshop: Workshop) -> None:
+    _, model, bakery = workshop()
+    listed = bakery.config.lightings.model_copy(update={"file": "lamps.json"})
+    other = replace(bakery, config=bakery.config.model_copy(update={"lightings": listed}))
+    with pytest.raises(UserError, match=r"lightings\.file: got lamps\.json"):
+        measure_budget(model, other)
+
+
+@pytest.mark.parametrize("channels", ["mono", pytest.param("multi", marks=pytest.mark.slow)])
+def test_stored_is_what_the_export_holds(channels: str, workshop: Workshop, tmp_path: Path) -> None:
+    from ddprt.runtime.train import fit
+
+    model = fit(workshop()[2].data, bases=5, channels=channels, centre="mean")
+    export_textures(model, tmp_path, precision="half", gutter=0, stitch=False)
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    layers = [read_exr(tmp_path / name)[0][model.covered] for name in manifest["layers"]]
+    kept = np.asarray(stored(model, "half").relighter.basis)  # type: ignore[attr-defined]
+    for index, (vector, scale) in enumerate(zip(kept, manifest["basis_scale"], strict=True)):
+        texture = layers[index // LAYER][:, index % LAYER] if channels == "mono" else layers[index].reshape(-1)
+        np.testing.assert_allclose(texture * np.float32(scale), vector, rtol=1e-6)  # two float32 products
+    mean = read_exr(tmp_path / "mean.exr")[0][model.covered].reshape(-1)
+    np.testing.assert_array_equal(mean, np.asarray(stored(model, "half").relighter.mean))  # type: ignore[attr-defined]
+    assert stored(model, "float") is model
+
+
+def test_bytes_that_ship(workshop: Workshop) -> None:
+    model = workshop()[1]
+    relighter = model.relighter
+    bases, entries = relighter.basis.shape  # type: ignore[attr-defined]
+    empty = 4 * entries  # of the mean, which is not there
+    assert shipped_bytes(model, "float") == relighter.nbytes - empty + 4 * bases
+    assert shipped_bytes(model, "float") - shipped_bytes(model, "half") == 2 * bases * entries
+    assert shipped_bytes(model, "half") - shipped_bytes(model, "byte") == bases * entries
+    nearest = workshop(fit__method="nearest")[1]
+    assert shipped_bytes(nearest, "float") == nearest.relighter.nbytes
+    assert shipped_bytes(nearest, "half") < 0.55 * nearest.relighter.nbytes
+    worse = [
+        float(np.abs(stored(nearest, name).relighter.maps - nearest.relighter.maps).max())  # type: ignore[attr-defined]
+        for name in ("float", "half", "byte")
+    ]
+    assert worse[0] == 0 < worse[1] < worse[2]
+    with pytest.raises(UserError, match='no precision "halb"'):
+        stored(model, "halb")
+
+
+def test_steps_are_told_apart_in_closed_form() -> None:
+    """Two constant steps of 1 and 2 in the same direction: squares 1 and 4, a cross term of 4, nine in all."""
+    field = lambda value: np.full((2, 5, 3), value, np.float32)  # noqa: E731
+    parts = take_apart([Link.sure("one", field(4)), Link.sure("two", field(3)), Link.sure("", field(1))], np.full(5, 0.2))
+    np.testing.assert_allclose(parts.products, [[1, 2], [2, 4]], rtol=1e-14)
+    assert (parts.squared, parts.closure) == (pytest.approx(9), pytest.approx(5 / 9))
+    assert parts.shrunk("one", 0.0) == pytest.approx(4)
+    assert parts.shrunk("two", 0.25) == pytest.approx(4)
+    assert parts.shrunk("three", 0.0) == pytest.approx(9)
+    assert parts.part("three") == 0
+
+
+def test_halves_that_differ_leave_nothing_over() -> None:
+    rng = np.random.default_rng(1)
+    draw = lambda: rng.normal(1, 1, (3, 7, 3)).astype(np.float32)  # noqa: E731
+    chain = [Link.sure("one", draw()), Link("two", (draw(), draw())), Link("", (draw(), draw()))]
+    document = take_apart(chain, np.full(7, 1 / 7)).record()
+    shares = [part["share"] for part in document["parts"]] + [pair["share"] for pair in document["cross_terms"]]
+    assert sum(shares) == pytest.approx(1, abs=1e-10)  # float64 sums of 63 products

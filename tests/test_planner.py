@@ -1,0 +1,135 @@
+"""The planner against worlds whose laws are known: it finds what meets a budget, says what cannot be met, and is frugal."""
+
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ddprt.bench.planner import KNOBS, Law, Place, Plan, Planner, Trial
+
+BASE: Place = (256.0, 128.0, 0.01, 128.0)
+VALUES = ((64.0, 128.0, 181.0, 256.0), (16.0, 32.0, 64.0, 128.0, 256.0), (0.005, 0.01, 0.02, 0.04), (64.0, 128.0, 256.0))
+LADDER = (2, 4, 8, 16, 32, 64, 128)
+BASES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
+
+
+def world(place: Place, rng: np.random.Generator | None = None) -> Trial:
+    """What a bake there would be found to be: powers that are not the prior's own, and some noise on the clock."""
+    resolution, lightings, noise, points = np.array(place) / BASE
+    rest = np.sqrt(
+        (0.02 * lightings**-0.6) ** 2 + (0.003 * noise) ** 2 + (0.02 * points**-0.4) ** 2 + (0.008 / resolution) ** 2
+    )
+    texels, jitter = 4e4 * resolution**2, rng.lognormal(0, 0.1) if rng else 1.0
+    return Trial(
+        place,
+        LADDER,
+        tuple(float(np.hypot(rest, 0.3 * bases**-0.8)) for bases in LADDER),
+        0.05,
+        tuple(20 + texels * bases * 1e-4 for bases in LADDER),
+        {name: tuple(texels * bases * size / 1e6 for bases in LADDER) for name, size in (("half", 2), ("float", 4))},
+        float(jitter * (1 + resolution**2 * (3 + 10 * lightings**0.6 * noise**-1.1))),
+        float(0.5 + 2 * resolution**2 * lightings),
+    )
+
+
+def measured(trial: Trial, plan: Plan) -> dict[str, float]:
+    at = lambda curve: float(np.exp(np.interp(np.log(plan.bases), np.log(LADDER), np.log(curve))))  # noqa: E731
+    return {
+        "relative_rmse": at(trial.errors),
+        "frame_us": at(trial.frame_us),
+        "megabytes": at(trial.megabytes[plan.precision]),
+        "bake_seconds": trial.bake_seconds,
+        "fit_seconds": trial.fit_seconds,
+    }
+
+
+def search(limits: dict[str, float], most: int = 12) -> tuple[str, int, Plan | None]:
+    rng = np.random.default_rng(0)
+    planner = Planner(BASE, VALUES, BASES, ("half", "float"), limits)
+    planner.add(world(BASE, rng))
+    while True:
+        plan, chance = planner.next()
+        found = next((trial for trial in planner.trials if trial.place == plan.place), None)
+        if found:
+            meets = all(measured(found, plan)[name] <= limit for name, limit in limits.items())
+            return "meets" if meets else planner.binding(), len(planner.trials), plan
+        if planner.hopeless(chance) or len(planner.trials) >= most:
+            return planner.binding(), len(planner.trials), None
+        planner.add(world(plan.place, rng))
+
+
+def budgets(count: int, room: tuple[float, float]) -> list[dict[str, float]]:
+    """Budgets about random plans, so that it is known that some plan meets them (room over 1)."""
+    rng = np.random.default_rng(1)
+    found = []
+    for _ in range(count):
+        place = tuple(float(rng.choice(values)) for values in VALUES)
+        reached = measured(world(place), Plan(place, int(rng.choice(LADDER)), "half"))
+        share = rng.uniform(*room)
+        found.append({name: share * reached[name] for name in ("relative_rmse", "frame_us", "megabytes", "bake_seconds")})
+    return found
+
+
+def test_budgets_with_room_are_met_in_few_trials() -> None:
+    found = [search(limits) for limits in budgets(10, (1.25, 1.6))]
+    assert sum(answer == "meets" for answer, _, _ in found) >= 9, "the target of nine in ten, with a clock that is off by 10 %"
+    places = len(list(product(*VALUES)))
+    assert max(trials for _, trials, _ in found) <= places / 10, "at most a tenth of the grid"
+
+
+@pytest.mark.parametrize(
+    ("limits", "binding"),
+    [
+        ({"relative_rmse": 0.004, "megabytes": 100.0}, "relative_rmse"),
+        ({"relative_rmse": 0.1, "megabytes": 1e-3}, "megabytes"),
+        ({"relative_rmse": 0.05, "bake_seconds": 0.1}, "bake_seconds"),
+        ({"frame_us": 1.0}, "frame_us"),
+        ({"relative_rmse": 0.05, "fit_seconds": 0.01}, "fit_seconds"),
+    ],
+)
+def test_what_cannot_be_met_is_named(limits: dict[str, float], binding: str) -> None:
+    answer, trials, _ = search(limits)
+    assert answer == binding
+    assert trials <= 6
+
+
+def test_without_an_asked_error_it_is_the_least_that_the_costs_allow() -> None:
+    limits = {"megabytes": 1.0, "bake_seconds": 20.0}
+    answer, _, plan = search(limits)
+    assert answer == "meets"
+    assert plan is not None
+    exact = {p: world(p) for p in product(*VALUES)}
+    plans = [Plan(p, bases, "half") for p in exact for bases in LADDER]
+    allowed = [q for q in plans if all(measured(exact[q.place], q)[name] <= limit for name, limit in limits.items())]
+    best = min(measured(exact[q.place], q)["relative_rmse"] for q in allowed)
+    # Safe plans keep clear of the limits (a bake law is off by 0.1 and more), which costs some error.
+    assert measured(exact[plan.place], plan)["relative_rmse"] <= 1.35 * best
+
+
+def test_a_law_is_the_prior_before_and_the_truth_after_many_trials() -> None:
+    rng = np.random.default_rng(2)
+    rows = np.concatenate([np.ones((200, 1)), rng.normal(size=(200, 2))], 1)
+    told = np.exp(rows @ [1.0, 0.5, -2.0] + 0.05 * rng.normal(size=200))
+    prior: Any = ((0.0, 0.0), (1.0, 1.0), 0.05)
+    assert Law.of(rows[:1] * [1, 0, 0], told[:1], *prior).mean[1:] == pytest.approx([0, 0])
+    law = Law.of(rows, told, *prior)
+    # 200 measurements that are off by 0.05: each term is known to 0.05 / sqrt(200), five of which are 0.018.
+    assert law.mean == pytest.approx([1.0, 0.5, -2.0], abs=0.018)
+    assert law.at(rows[0]).spread == pytest.approx(0.05, rel=0.02)
+    assert Law.of(rows[:1] * [1, 0, 0], told[:1], *prior).at(np.array([1.0, 1.0, 0.0])).spread > 1
+
+
+def test_a_tried_place_is_told_as_it_was_measured() -> None:
+    planner = Planner(BASE, VALUES, BASES, ("half", "float"), {"relative_rmse": 0.1})
+    other = (128.0, 64.0, 0.02, 128.0)
+    for place in (BASE, other):
+        planner.add(world(place))
+    for place, bases, precision in product((BASE, other), LADDER, ("half", "float")):
+        plan = Plan(place, bases, precision)
+        for name, value in measured(world(place), plan).items():
+            assert np.exp(planner.guesses(plan)[name].mean) == pytest.approx(value, rel=1e-9), name
+
+
+def test_knobs_and_places_are_of_one_length() -> None:
+    assert len(KNOBS) == len(BASE) == len(VALUES)
