@@ -81,14 +81,14 @@ def example(changes: dict[str, Any], order: int) -> dict[str, Any]:
         "psnr_db": -20 * math.log10(error) + 14,
         "pu21_psnr_db": -20 * math.log10(error) + 21 + 0.3 * jitter(),
         "flip": flip,
-        "flip_missing": "the scene has no camera" if flip is None else "",
+        "flip_reason": "the scene has no camera" if flip is None else "",
         "energy_bias": -0.1 * error,
         "median_lighting_relative_rmse": 0.7 * error,
         "p90_lighting_relative_rmse": 1.6 * error,
         "worst_lighting_relative_rmse": 3.2 * error * jitter(),
         "negative_share": 0.002,
         "flicker": 0.0 if method == "mean" else 0.2 * error * jitter(),
-        "unseen": 0,
+        "unseen_lightings": 0,
     }
     name = ", ".join(f"{key} = {value:g}" if isinstance(value, float) else f"{key} = {value}" for key, value in changes.items())
     linear = method == "svd-ridge"
@@ -409,7 +409,7 @@ def test_ticks_are_few_rise_and_are_told_apart(form: str, start: float, decades:
 
 def test_ticks_say_what_they_are() -> None:
     assert [text for _, text in ticks(0.9 * 2**18, 1.1 * 2**22, "bytes")] == ["256 KiB", "512 KiB", "1 MiB", "2 MiB", "4 MiB"]
-    assert ticks(0.009, 0.11, "percent") == [(0.01, "1\u00a0%"), (0.02, "2\u00a0%"), (0.05, "5\u00a0%"), (0.1, "10\u00a0%")]
+    assert ticks(0.009, 0.11, "percent") == [(0.01, "1\u00a0%"), (0.03, "3\u00a0%"), (0.1, "10\u00a0%")]
     assert [text for _, text in ticks(0.001, 0.1, "decibel")] == ["60 dB", "50 dB", "40 dB", "30 dB", "20 dB"]
     assert [text for _, text in ticks(9e-6, 2e-2, "seconds")] == ["10 µs", "100 µs", "1 ms", "10 ms"]
 
@@ -453,12 +453,13 @@ def test_labels_lie_apart_and_inside(found: Sweep, monkeypatch: pytest.MonkeyPat
     placed = fronts._placed
 
     def watched(axes: Any, cloud: Any, index: int, text: str, frame: Any, taken: list[Any]) -> bool:
+        before = len(taken)
         done = placed(axes, cloud, index, text, frame, taken)
         if done:
-            box = taken[-1]
+            box = taken[before]
             assert frame.x0 <= box.x0 < box.x1 <= frame.x1
             assert frame.y0 <= box.y0 < box.y1 <= frame.y1
-            assert not any(box.overlaps(other) for other in taken[:-1])
+            assert not any(box.overlaps(other) for other in taken[:before])
             boxes.append(box)
         return done
 

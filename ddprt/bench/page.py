@@ -23,7 +23,7 @@ from ddprt.report.page import _bytes, _count, _percent, _seconds
 PAGE, TABLE = "frontier.html", "frontier.csv"
 BASE, SEVERAL = "as configured", "several knobs at once"
 _ROOM, _TINY = 0.08, 1.5  # free part at each end of an axis, and the least ratio of its ends
-_FEWEST, _MOST = 4, 6  # ticks
+_FEWEST, _MOST = 3, 6  # ticks
 _FLAT = 1e4  # a tenth of the error for so many times the cost is as good as never
 _MANTISSAS = ((1,), (1, 3), (1, 2, 5), (1, 1.5, 2, 3, 5, 7), tuple(i / 10 for i in range(10, 100)))
 _BINARY = ((1,), (1, 1.5), (1, 1.25, 1.5, 1.75), tuple(1 + i / 16 for i in range(16)))
@@ -245,7 +245,7 @@ class Sweep:
 
     def missing(self) -> list[str]:
         """Why a score is missing, each reason once."""
-        reasons = [record["scores"].get("flip_missing") for record in self.settings if record["scores"].get("flip") is None]
+        reasons = [record["scores"].get("flip_reason") for record in self.settings if record["scores"].get("flip") is None]
         return list(dict.fromkeys(f"HDR-FLIP: {reason}" for reason in reasons if reason))
 
     def _row(self, record: Record, on: list[str]) -> dict[str, Any]:

@@ -200,6 +200,9 @@ def _boxes(axes: Any, cloud: Cloud, drawn: Sequence[int], x: Axis) -> list[Any]:
         px, py = axes.transData.transform((cloud.costs[index], cloud.errors[index]))
         reach = radii[index] * point
         found.append(Bbox([(px - reach, py - reach), (px + reach, py + reach)]))
+        if cloud.high[index] > cloud.low[index]:
+            bar = axes.transData.transform([(end[index], cloud.errors[index]) for end in (cloud.low, cloud.high)])
+            found.append(Bbox([bar[0] - 0.3 * point, bar[1] + 0.3 * point]))
     ends = [*(cloud.costs[list(cloud.front)]), x.high]
     for index, end in zip(cloud.front, ends[1:], strict=True):
         px, py = axes.transData.transform((cloud.costs[index], cloud.errors[index]))
@@ -227,7 +230,7 @@ def _points(axes: Any, cloud: Cloud, x: Axis, y: Axis) -> list[int]:
             ends = cloud.low[index], cloud.high[index]
             colour = cloud.markers[cloud.kinds[index]][1] if index in own else _GREY
             axes.plot(ends, [cloud.errors[index]] * 2, color=colour, lw=0.6, zorder=2.2, solid_capstyle="butt")
-    for index in (index for index in drawn if index in own):
+    for index in sorted((index for index in drawn if index in own), key=lambda index: index == cloud.base):
         colour = cloud.markers[cloud.kinds[index]][1]
         look = {"color": colour, "mec": "white", "mew": 0.4, "zorder": 3, "linestyle": "none", "clip_on": False}
         axes.plot(cloud.costs[index], cloud.errors[index], marker=_outline(cloud, index), markersize=5.2, **look)
@@ -267,7 +270,7 @@ def _placed(axes: Any, cloud: Cloud, index: int, text: str, frame: Any, taken: l
         words = [other for other in taken if other.height > _LETTERS]
         free = not any(box.overlaps(other) for other in taken)
         if inside and free and not any(other.overlaps(bit) for bit in line for other in words):
-            taken += [*line, box]
+            taken += [box, *line]
             return True
         said.remove()
     return False
