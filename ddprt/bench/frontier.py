@@ -1,6 +1,7 @@
 """A sweep: every setting tried and noted in one file, which a sweep that was stopped goes on from."""
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -46,9 +47,10 @@ def _sweep(config: Config, settings: list[Setting], folder: Path, progress: Prog
     if todo and not workshop.yardstick.held_out:  # baked first: what hinders that hinders every setting
         raise UserError("lightings.test: got none, expected at least 1 to score on")
     for index, setting in enumerate(todo):
-        with progress.stage(f"{index + 1} of {len(todo)}: {setting.name}") as stage:
-            record = _tried(workshop, setting)
-            stage.facts["error"] = record["failed"] or f"{record['scores']['relative_rmse']:.4g}"
+        begun = time.perf_counter()
+        record = _tried(workshop, setting)
+        came = record["failed"] or f"error {record['scores']['relative_rmse']:.4g}"
+        progress.say(f"{index + 1} of {len(todo)}: {setting.name}: {came} ({time.perf_counter() - begun:.1f} s)")
         append_line(path, json.dumps(record, allow_nan=False))
         known[setting.digest] = record
         rest = {other.bake_digest for other in todo[index + 1 :]}

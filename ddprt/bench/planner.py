@@ -23,6 +23,7 @@ KNOBS = ("atlas.resolution", "lightings.train", "transport.target_noise", "point
 """Dear knobs, each of which asks for another bake."""
 _SURE = 0.9  # chance of meeting a limit from which a plan counts as safe
 _HOPELESS = 0.02
+_WORTHWHILE = 0.05  # promised fall of the error, in logarithms, that another bake is made for
 _AGAIN = 0.03  # by how much a measurement differs when it is made again, in logarithms
 _TINY = 1e-12
 _FREE = 3.0  # standard deviation of a constant that nothing is known of, in logarithms
@@ -127,6 +128,8 @@ class Planner:
       bases: numbers of bases that may be asked for, rising.
       precisions: that may be stored.
       limits: the budget; quantities that are missing are free.
+      trials: what was learned from.
+      barred: places that cannot be baked.
     """
 
     base: Place
@@ -135,6 +138,7 @@ class Planner:
     precisions: Sequence[str]
     limits: Mapping[str, float]
     trials: list[Trial] = field(default_factory=list)
+    barred: set[Place] = field(default_factory=set)
     _laws: dict[str, Law] = field(default_factory=dict)
 
     def add(self, trial: Trial) -> None:
@@ -146,22 +150,31 @@ class Planner:
         }
 
     def next(self) -> tuple[Plan, float]:
-        """The plan that is likeliest to meet the budget, and the chance that it does.
+        """The plan to try or to take next, and the chance that it meets the budget.
 
-        Of plans that are safe the one with the least error is taken where no error is asked for, else the cheapest bake.
+        A plan whose place was tried is taken as soon as it is safe. Before that, the likeliest to meet the budget; of plans
+        that are safe, the cheapest bake. Where no error is asked for it is the least one that is safe, and a place that was
+        tried is only left for one that promises a twentieth less.
         """
-        best: tuple[tuple[float, float], Plan, float] | None = None
+        asked = "relative_rmse" in self.limits
+        best: dict[bool, tuple[tuple[float, float], Plan, float]] = {}
         for place in product(*self.values):
+            if place in self.barred:
+                continue
             told = self._of_place(place)
             for bases, precision in product(self.bases, self.precisions):
                 guesses = self._guesses(told, bases, precision)
                 chance = float(np.exp(sum(guesses[name].chance(limit) for name, limit in self.limits.items())))
-                wanted = guesses["bake_seconds" if "relative_rmse" in self.limits else "relative_rmse"].mean
-                rank = (min(chance, _SURE), -wanted)
-                if best is None or rank > best[0]:
-                    best = rank, Plan(place, bases, precision), chance
-        assert best is not None, "every knob has a value"
-        return best[1], best[2]
+                rank = min(chance, _SURE), -guesses["bake_seconds" if asked else "relative_rmse"].mean
+                tried = told[1]
+                if tried not in best or rank > best[tried][0]:
+                    best[tried] = rank, Plan(place, bases, precision), chance
+        there, elsewhere = best.get(True), best.get(False)
+        if elsewhere is None or there is None:
+            (_, plan, chance) = there or elsewhere or (None, Plan(self.base, self.bases[0], self.precisions[0]), 0.0)
+            return plan, chance
+        safe = there[0][0] == _SURE and (asked or elsewhere[0][1] - there[0][1] < _WORTHWHILE)
+        return (there if safe or there[0] >= elsewhere[0] else elsewhere)[1:]
 
     def hopeless(self, chance: float) -> bool:
         """Whether a chance is too small to go on."""

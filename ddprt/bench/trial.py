@@ -79,6 +79,7 @@ class Workshop:
         config, lightings = self._training_only(setting.config)
         scene = load_scene(config.scene.name, **config.scene.parameters)
         progress = Progress(self.progress.quiet)
+        progress.say(f"bake: {setting.name}")
         with peak_memory() as peak:
             begun = time.perf_counter()
             data = bake(scene, lightings, config=config, out=folder, progress=progress)

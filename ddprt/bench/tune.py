@@ -105,8 +105,12 @@ class Search:
                 continue
             if planner.hopeless(chance) or len(planner.trials) >= self.config.tune.trials:
                 break
-            progress.say(f"next: {self._setting(plan).name}, a chance of {chance:.0%}")
-            self._try(plan.place)
+            progress.say(f"next: {self._name(plan.place)}, a chance of {chance:.0%}")
+            try:
+                self._try(plan.place)
+            except UserError as error:
+                progress.say(f"left out: {error}")
+                planner.barred.add(plan.place)
         if not verified:  # the best plan lies where no trial may be made any more
             plan = self._best_tried()
             verified[plan] = self._verify(plan)
@@ -138,26 +142,28 @@ class Search:
     def _try(self, place: Place) -> None:
         """Bakes at a place, and scores all numbers of bases."""
         setting = self._setting(Plan(place, max(BASES), "float"))
-        with self.workshop.progress.stage(f"trial {len(self.planner.trials) + 1}: {setting.name}") as stage:
-            data, baked = self.workshop.bake(setting)
-            model, fitted = self._fit(setting, data)
-            sizes = [count for count in _SCORED if count < model.relighter.report.bases] + [model.relighter.report.bases]
-            shorter = [first_bases(model, count) for count in sizes]
-            tallies = [self.workshop.yardstick.tally(stored(one, "half")) for one in shorter]
-            errors = [_error(tally) for tally in tallies]
-            values = data.values(data.split("train")[:1], model.points, model.quantity)[0]
-            trial = Trial(
-                place,
-                tuple(sizes),
-                tuple(errors),
-                spread_of(tallies[-1]),
-                tuple(_frame_us(one, values) for one in shorter),
-                {name: tuple(shipped_bytes(one, name) / 1e6 for one in shorter) for name in _PRECISIONS},
-                baked["seconds"],
-                fitted,
-            )
-            stage.facts["error"] = f"{errors[-1]:.4g} at {sizes[-1]} bases"
+        data, baked = self.workshop.bake(setting)
+        model, fitted = self._fit(setting, data)
+        sizes = [count for count in _SCORED if count < model.relighter.report.bases] + [model.relighter.report.bases]
+        shorter = [first_bases(model, count) for count in sizes]
+        tallies = [self.workshop.yardstick.tally(stored(one, "half")) for one in shorter]
+        errors = [_error(tally) for tally in tallies]
+        values = data.values(data.split("train")[:1], model.points, model.quantity)[0]
+        trial = Trial(
+            place,
+            tuple(sizes),
+            tuple(errors),
+            spread_of(tallies[-1]),
+            tuple(_frame_us(one, values) for one in shorter),
+            {name: tuple(shipped_bytes(one, name) / 1e6 for one in shorter) for name in _PRECISIONS},
+            baked["seconds"],
+            fitted,
+        )
         self.planner.add(trial)
+        curve = ", ".join(f"{error:.3g} at {bases}" for bases, error in zip(sizes, errors, strict=True))
+        self.workshop.progress.say(
+            f"trial {len(self.planner.trials)}: {self._name(place)}: {baked['seconds']:.1f} s of bake, error {curve} bases"
+        )
         record = {**about(setting), "trial": asdict(trial), "bake": baked, "environment": environment()}
         append_line(self.workshop.folder / "trials.jsonl", json.dumps(record, allow_nan=False))
 
@@ -193,6 +199,10 @@ class Search:
         }
         changes |= {"fit.bases": plan.bases, "export.precision": plan.precision}
         return Setting(changes, changed(self.config, changes))
+
+    def _name(self, place: Place) -> str:
+        turned = [(knob, value) for knob, value, base in zip(KNOBS, place, self.base, strict=True) if value != base]
+        return ", ".join(f"{knob} = {value:g}" for knob, value in turned) or "as configured"
 
     def _chance(self, plan: Plan) -> float:
         guesses = self.planner.guesses(plan)
