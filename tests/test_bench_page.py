@@ -595,7 +595,7 @@ def test_a_wicked_name_runs_nothing(tmp_path: Path) -> None:
     assert "<title>run" not in dumped
     assert "<strong>&lt;img src=x" in dumped, "what is pointed at is named as text"
     assert "<img src=" not in dumped.split("<noscript>")[0]
-    assert len(re.findall(r'data-index="\d', dumped)) == 8
+    assert len(re.findall(r'<a [^>]*data-index="\d', dumped)) == 8
 
 
 if __name__ == "__main__":
