@@ -436,16 +436,37 @@ def test_figures_are_a_column_wide_and_their_text_is_text(cost: str, folder: Pat
 
 
 def test_fronts_are_drawn_as_steps_through_their_settings(found: Sweep) -> None:
-    """Upright at the cost of each setting and where the axis ends."""
+    """Upright at the cost of each setting and where the axis ends; there it comes down to that setting's error."""
     for cost in DRAWN:
         (line,) = re.findall(
             r'<path d="([^"]*)"[^>]*stroke: #24292f; stroke-width: 0.9; stroke-linecap: square', found.figure(cost)
         )
         places = np.array([[float(number) for number in pair] for pair in re.findall(r"[ML] (\S+) (\S+)", line)])
         assert (np.diff(places, axis=0) == 0).any(1).all(), "every stretch is level or upright"
-        assert len(np.unique(places[:, 0])) == len(pareto.path(*found.pair("error", cost))) + 1
-        assert (np.diff(places[:, 0]) >= 0).all()
-        assert (np.diff(places[:, 1]) >= 0).all(), "downwards on paper"
+        assert (np.diff(places, axis=0) >= 0).all(), "to the right, and downwards on paper"
+        costs, errors = found.pair("error", cost)
+        logarithms = np.log([errors[index] for index in pareto.path(costs, errors)])
+        across = np.unique(places[:, 0])[:-1]
+        assert len(across) == len(logarithms)
+        down = np.array([places[places[:, 0] == x, 1].max() for x in across])
+        # six decimals are written, of points; the front spans more than 10 of them
+        expected = (logarithms - logarithms[0]) / (logarithms[-1] - logarithms[0])
+        np.testing.assert_allclose((down - down[0]) / (down[-1] - down[0]), expected, rtol=0, atol=4 * 0.5e-6 / 10)
+
+
+def test_dollars_in_a_name_are_no_formula() -> None:
+    sweep = bent([(1, 0.5), (10, 0.005), (1e4, 0.0005)])
+    sweep.settings[1]["name"] = "$x_1$ = 2"
+    assert "knee: $x_1$ = 2" in written(sweep.figure("bake"))
+
+
+def test_axes_hold_the_bars() -> None:
+    sweep = bent([(1, 0.5), (2, 0.4)])
+    for record, low, high in zip(sweep.settings, (1e-9, 1e-5), (1e-3, 50.0), strict=True):
+        record["frame"] |= {"low": low, "high": high}
+    axis = sweep.axis(COSTS["frame"])
+    assert axis.low < 1e-9
+    assert axis.high > 50
 
 
 def test_labels_lie_apart_and_inside(found: Sweep, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -567,10 +588,14 @@ def test_page_works_in_a_browser(page: str, found: Sweep, tmp_path: Path) -> Non
 def test_a_wicked_name_runs_nothing(tmp_path: Path) -> None:
     records = [example({}, 0), {**example({"scene.name": "x"}, 1), "name": "<img src=x onerror=document.title='run'>"}]
     wicked = write_page(tmp_path / "page.html", records, title="</script><script>document.title='run'</script>")
+    hover = "document.querySelectorAll('a[data-index=\"1\"]')[0].dispatchEvent(new PointerEvent('pointerenter'))"
+    text = wicked.read_text("utf-8").replace("</body>", f"<script>setTimeout(() => {hover}, 200)</script></body>")
+    wicked.write_text(text, "utf-8")
     dumped = browsed(wicked, tmp_path / "profile")
     assert "<title>run" not in dumped
+    assert "<strong>&lt;img src=x" in dumped, "what is pointed at is named as text"
     assert "<img src=" not in dumped.split("<noscript>")[0]
-    assert len(re.findall(r'data-index="\d', dumped)) == 8
+    assert len(re.findall(r'<a [^>]*data-index="\d', dumped)) == 8
 
 
 if __name__ == "__main__":
