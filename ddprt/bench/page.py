@@ -17,8 +17,8 @@ from ddprt import __version__
 from ddprt.bench import pareto
 from ddprt.bench.pareto import COSTS, DRAWN, ERRORS, Form, Leg, Measure, Record
 from ddprt.files import make_folder, write_text
+from ddprt.report import words
 from ddprt.report.fronts import SHAPES, STAR, Axis, Cloud, front_figure, marker
-from ddprt.report.page import _bytes, _count, _percent, _seconds
 
 PAGE, TABLE = "frontier.html", "frontier.csv"
 BASE, SEVERAL = "as configured", "several knobs at once"
@@ -118,7 +118,7 @@ class Sweep:
         """What no setting can be seen to pass: noise of the held-out maps, and what the base's basis leaves."""
         named = {"noise": "noise floor", "projection": "projection floor"}
         found = [(text, pareto.number(self.base or {}, f"floors.{key}_relative_rmse")) for key, text in named.items()]
-        return [(f"{text} ({_percent(level)})", level) for text, level in found if level]
+        return [(f"{text} ({words.percent(level)})", level) for text, level in found if level]
 
     def axis(self, measure: Measure, more: Sequence[float] = ()) -> Axis:
         """An axis that holds all settings, the bars of their repeats, and more."""
@@ -331,10 +331,10 @@ def _plain(measure: Measure, record: Record) -> str:
 
 def _say(value: float, form: Form) -> str:
     if form == "gib":
-        return _bytes(value * 2**30)
+        return words.size(value * 2**30)
     if form == "percent":
-        return _percent(value) if value >= 1e-3 else f"{100 * value:.2g}\u00a0%"
-    ways: Mapping[str, Any] = {"seconds": _seconds, "bytes": _bytes, "count": _count}
+        return words.percent(value) if value >= 1e-3 else f"{100 * value:.2g}\u00a0%"
+    ways: Mapping[str, Any] = {"seconds": words.seconds, "bytes": words.size, "count": words.count}
     return ways[form](value)
 
 

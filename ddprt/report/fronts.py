@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ddprt.report.figures import INK, _figure, _save, _style
+from ddprt.report.drawing import INK, blank, saved, style
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito's, told apart by all
 _GREY = "#9aa2aa"  # of what is dominated
@@ -131,15 +131,15 @@ def front_figure(cloud: Cloud, x: Axis, y: Axis, *, floors: Sequence[tuple[str, 
     used = sorted({kind for kind, cost, error in zip(cloud.kinds, cloud.costs, cloud.errors, strict=True) if cost * error > 0})
     legend = _ROW * -(-len(used) // _COLUMNS)
     height = _PLOT + legend
-    with _style({"svg.hashsalt": f"{x.title}/{y.title}", "font.size": 7, "axes.labelsize": 7, "axes.grid": False}):
-        figure = _figure(_WIDTH, height, layout=None)
+    with style({"svg.hashsalt": f"{x.title}/{y.title}", "font.size": 7, "axes.labelsize": 7, "axes.grid": False}):
+        figure = blank(_WIDTH, height, layout=None)
         FigureCanvasAgg(figure)
         bottom = (legend + _BELOW) / height
         axes = figure.add_axes((0.165, bottom, 0.795, 1 - bottom - 0.06 / height))
         _scale(axes, x, y)
         if not used:
             axes.text(0.5, 0.5, note, transform=axes.transAxes, ha="center", color=INK["muted"], parse_math=False)
-            return _save(figure, "svg", metadata={"Date": None, "Creator": None}).decode()
+            return saved(figure, "svg", metadata={"Date": None, "Creator": None}).decode()
         drawn = _points(axes, cloud, x, y)
         taken = _boxes(axes, cloud, drawn, x)
         _floors(axes, floors, y, taken)
@@ -149,7 +149,7 @@ def front_figure(cloud: Cloud, x: Axis, y: Axis, *, floors: Sequence[tuple[str, 
             handles=handles, loc="lower left", bbox_to_anchor=(0.02, 0), ncols=_COLUMNS, frameon=False, fontsize=_SMALL,
             handletextpad=0.1, labelspacing=0.25, columnspacing=1.0, borderpad=0.1, handlelength=1.6,
         )  # fmt: skip
-        return _save(figure, "svg", metadata={"Date": None, "Creator": None}).decode()
+        return saved(figure, "svg", metadata={"Date": None, "Creator": None}).decode()
 
 
 def _scale(axes: Any, x: Axis, y: Axis) -> None:
