@@ -319,7 +319,7 @@ def _read_stored(path: Path) -> Stored:
     image, attributes = read_exr(path)
     try:
         exposure = int(attributes.get("ddprt_exposure", "0"))
-        np.ldexp(np.float32(1), exposure)
+        np.ldexp(np.float32(0), exposure)
     except (ValueError, OverflowError):
         raise UserError(
             f"{path}: got exposure {attributes['ddprt_exposure']!r}, expected a whole number; bake it again"
