@@ -89,7 +89,10 @@ class Search:
         self.config, self.workshop = config, workshop
         self.base: Place = tuple(float(_value(config, knob)) for knob in KNOBS)
         values = [_around(config, knob, base) for knob, base in zip(KNOBS, self.base, strict=True)]
-        self.planner = Planner(self.base, values, BASES, _PRECISIONS, self.limits)
+        self.bases = tuple(
+            count for count in BASES if count > (config.fit.centre == "mean")
+        )  # the mean alone is another method
+        self.planner = Planner(self.base, values, self.bases, _PRECISIONS, self.limits)
 
     def run(self) -> Outcome:
         """Searches."""
@@ -106,7 +109,7 @@ class Search:
             if tried:
                 verified[plan] = self._verify(plan)
                 continue
-            if planner.hopeless(chance) or len(planner.trials) >= self.config.tune.trials:
+            if planner.hopeless(chance) or len(planner.trials) + len(planner.barred) >= self.config.tune.trials:
                 break
             progress.say(f"next: {self._name(plan.place)}, a chance of {chance:.0%}")
             self._tried(plan.place)
@@ -153,7 +156,8 @@ class Search:
         setting = self._setting(Plan(place, max(BASES), "float"))
         data, baked = self.workshop.bake(setting)
         model, fitted = self._fit(setting, data)
-        sizes = [count for count in _SCORED if count < model.relighter.report.bases] + [model.relighter.report.bases]
+        most = model.relighter.report.bases
+        sizes = [count for count in _SCORED if count in self.bases and count < most] + [most]
         shorter = [first_bases(model, count) for count in sizes]
         tallies = [self.workshop.yardstick.tally(stored(one, "half")) for one in shorter]
         errors = [_error(tally) for tally in tallies]
@@ -219,7 +223,7 @@ class Search:
 
     def _best_tried(self) -> Plan:
         places = [trial.place for trial in self.planner.trials]
-        plans = [Plan(*parts) for parts in product(places, BASES, _PRECISIONS)]
+        plans = [Plan(*parts) for parts in product(places, self.bases, _PRECISIONS)]
         return max(plans, key=self._chance)
 
 
