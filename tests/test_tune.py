@@ -255,6 +255,15 @@ def test_a_base_that_takes_too_long_is_begun_below(tmp_path: Path, monkeypatch: 
     assert (search.base in bench.asked) >= (not works), "what is coarser cannot be baked: the base is tried instead"
 
 
+def test_of_plans_that_are_as_far_off_the_nearest_errs_least(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    search = searching(tmp_path, tune__max_bake_seconds=1e-3, tune__trials=1)
+    Bench(monkeypatch)
+    monkeypatch.setattr(Search, "_start", lambda search: search.base)
+    outcome = search.run()
+    assert outcome.binding == "bake_seconds"
+    assert outcome.plan.bases >= 16, "the bake costs the same, however many bases are kept"
+
+
 def test_no_more_bakes_than_allowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     search = searching(tmp_path, tune__max_relative_rmse=0.3, tune__trials=2)
     bench = Bench(monkeypatch)

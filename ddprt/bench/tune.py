@@ -224,7 +224,7 @@ class Search:
     def _best_tried(self) -> Plan:
         places = [trial.place for trial in self.planner.trials]
         plans = [Plan(*parts) for parts in product(places, self.bases, _PRECISIONS)]
-        return max(plans, key=self._chance)
+        return max(plans, key=lambda plan: (self._chance(plan), -self.planner.guesses(plan)["relative_rmse"].mean))
 
 
 def tune(config: Config, folder: Path, progress: Any) -> Outcome:
