@@ -141,9 +141,9 @@ def test_listed_lightings_keep_the_nearest_held_out_one(shop: Workshop, tmp_path
     places = [middle + i * shift for i in range(-3, 4)] + [np.array([middle[0], high[1] - 0.01, middle[2]])]
     listed = tmp_path / "lightings.json"
     listed.write_text(json.dumps([lamp(place) for place in places]))
-    config = changed(
-        BASE, {"lightings.file": str(listed), "lightings.train": 5, "lightings.validation": 1, "lightings.test": 2}
-    )
+    counts = {"lightings.train": 5, "lightings.validation": 1, "lightings.test": 2}
+    # A hundred points of two samples are 0.07 m apart: nearer to a surface than that is the last lamp alone.
+    config = changed(BASE, {"lightings.file": str(listed), "points.count": 100, **counts})
     own = Workshop(config, tmp_path / "own", Progress(quiet=True))
     data, _ = own.bake(Setting({}, config))
     whole = ddprt.bake(own.scene, config=config, out=tmp_path / "whole")
