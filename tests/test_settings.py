@@ -41,7 +41,7 @@ def test_settings_that_share_a_dataset_stand_together() -> None:
         ("points.quantity", "irradiance", True),
         ("transport.threads", 1, True),
         ("transport.test_samples", 64, True),
-        ("lightings.test", 5, True),
+        ("lightings.test", 5, False),
         ("export.precision", "float", True),
         ("seed", 7, False),
         ("points.supersample", 2, False),
@@ -108,6 +108,34 @@ def test_the_plan_of_our_own_holds_and_turns_every_kind_of_knob() -> None:
     assert len({setting.digest for setting in found}) == len(found) > 30
     for key in plan:
         assert any(key in setting.changes for setting in found), key
+
+
+def test_knobs_that_a_file_or_another_setting_overrules_are_not_in_the_plan() -> None:
+    plan = plan_of(
+        changed(
+            Config(),
+            {"lightings.file": "a.json", "points.file": "b.json", "transport.samples": 3, "transport.integrator": "paths"},
+        )
+    )
+    assert not {"lightings.train", "points.supersample", "fit.points", "transport.target_noise"} & set(plan)
+    assert plan["transport.samples"] == (1, 6)
+    assert "transport.sender_resolution" not in plan
+    assert "transport.samples" not in plan_of(Config())
+
+
+def test_the_plan_stays_within_what_settings_take() -> None:
+    for changes in ({"transport.target_noise": 1e-4}, {"transport.target_noise": 1.0}, {"transport.samples": 65536}):
+        assert settings_of(changed(Config(), changes))
+
+
+def test_a_grid_that_nobody_meant_is_refused_at_once() -> None:
+    """The plan of our own in all combinations is some 10^7 settings."""
+    base = changed(Config(), {"bench.combine": "grid"})
+    with pytest.raises(UserError, match=r"\[sweep\]: got a grid of \d{7,} settings, expected at most 10000; name fewer"):
+        settings_of(base)
+    exact = base.model_copy(update={"sweep": {"seed": tuple(range(101)), "fit.points": tuple(range(100))}})
+    with pytest.raises(UserError, match="got a grid of 10100 settings"):
+        settings_of(exact)
 
 
 def test_small_configurations_get_a_plan_that_can_be_baked() -> None:

@@ -5,14 +5,12 @@ import time
 from pathlib import Path
 from typing import Any
 
-from ddprt import __version__
 from ddprt.bench.page import write_all
 from ddprt.bench.settings import Setting, settings_of
-from ddprt.bench.trial import Workshop, about, environment
+from ddprt.bench.trial import Workshop, about, environment, why
 from ddprt.config import Config
 from ddprt.errors import UserError
 from ddprt.files import alone_in, append_line, make_folder
-from ddprt.machine import machine
 from ddprt.progress import Progress
 
 RESULTS = "results.jsonl"
@@ -39,13 +37,14 @@ def sweep(config: Config, folder: Path, progress: Progress) -> list[Path]:
 def _sweep(config: Config, settings: list[Setting], folder: Path, progress: Progress) -> list[Path]:
     path = folder / RESULTS
     known = read_results(path)
-    todo = [setting for setting in settings if not _holds(known, setting)]
-    found = len(settings) - len(todo)
-    progress.say(f"sweep: {len(settings)} settings" + (f", {found} of them measured before" if found else ""))
     finest = max(setting.config.atlas.resolution for setting in settings)
     workshop = Workshop(config, folder, progress, finest)
-    if todo and not workshop.yardstick.held_out:  # baked first: what hinders that hinders every setting
-        raise UserError("lightings.test: got none, expected at least 1 to score on")
+    workshop.check(config)
+    todo = [setting for setting in settings if not workshop.holds(known.get(setting.digest, {}), setting)]
+    found = len(settings) - len(todo)
+    progress.say(f"sweep: {len(settings)} settings" + (f", {found} of them measured before" if found else ""))
+    if todo:
+        _ = workshop.yardstick  # baked first: what hinders that hinders every setting
     for index, setting in enumerate(todo):
         begun = time.perf_counter()
         record = _tried(workshop, setting)
@@ -56,6 +55,8 @@ def _sweep(config: Config, settings: list[Setting], folder: Path, progress: Prog
         rest = {other.bake_digest for other in todo[index + 1 :]}
         if not config.bench.keep and setting.bake_digest not in rest:
             workshop.forget(setting)
+    if not config.bench.keep:
+        workshop.forget_all(but_truth=True)
     records = [known[setting.digest] for setting in settings]
     if all(record["failed"] for record in records):
         raise UserError(f"sweep: got no setting that works, expected one at least; the first says: {records[0]['failed']}")
@@ -80,20 +81,9 @@ def read_results(path: Path) -> dict[str, dict[str, Any]]:
     return found
 
 
-def _holds(known: dict[str, dict[str, Any]], setting: Setting) -> bool:
-    """Whether a setting was measured by this version on a machine like this; seconds of another say nothing here."""
-    record = known.get(setting.digest)
-    if record is None or record["failed"]:
-        return False
-    there, here = record["environment"], machine()
-    alike = all(there["machine"].get(key) == here[key] for key in ("processor", "cores", "system"))
-    return there["ddprt"] == __version__ and alike
-
-
 def _tried(workshop: Workshop, setting: Setting) -> dict[str, Any]:
     """The record of a setting, or of why it cannot be."""
     try:
         return workshop.measure(setting)
     except (UserError, MemoryError) as error:
-        why = str(error) or "got too little memory, expected enough for this setting; lower it"
-        return {**about(setting), "failed": why, "environment": environment()}
+        return {**about(setting), "failed": why(error), "environment": environment()}

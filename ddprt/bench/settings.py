@@ -3,11 +3,13 @@
 import hashlib
 import itertools
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 from ddprt.config import Config, checked
+from ddprt.errors import UserError
 from ddprt.methods import METHODS
 
 ASKED = ("bench", "sweep", "budget", "tune", "report")
@@ -15,6 +17,8 @@ ASKED = ("bench", "sweep", "budget", "tune", "report")
 BAKED = ("scene", "atlas", "lightings", "points", "transport")
 """Sections that a dataset depends on."""
 _HALVINGS = (8, 4, 2)
+_MOST = 10_000
+"""Settings of a sweep: at a second each that is hours, and beyond it a grid that nobody meant."""
 
 
 @dataclass(frozen=True)
@@ -37,16 +41,18 @@ class Setting:
     @property
     def digest(self) -> str:
         """Hash of all that the results depend on."""
-        return _digest(self.config.model_dump(mode="json", exclude=set(ASKED)))
+        return digest_of(self.config.model_dump(mode="json", exclude=set(ASKED)))
 
     @property
     def bake_digest(self) -> str:
-        """Hash of all that the training maps depend on: equal ones share a dataset."""
+        """Hash of all that training maps and points depend on: equal ones share a dataset.
+
+        Held-out lightings count, since `points.depth` goes by the nearest of all lamps.
+        """
         document = self.config.model_dump(mode="json", include={*BAKED, "seed"})
-        document["points"].pop("quantity")
-        for unused, section in (("test", "lightings"), ("test_samples", "transport"), ("threads", "transport")):
+        for unused, section in (("quantity", "points"), ("test_samples", "transport"), ("threads", "transport")):
             document[section].pop(unused)
-        return _digest(document)
+        return digest_of(document)
 
 
 def changed(config: Config, changes: dict[str, Any]) -> Config:
@@ -71,10 +77,16 @@ def settings_of(config: Config) -> list[Setting]:
     Args:
       config: with [sweep], or without one for `plan_of`; `bench.combine` says whether knobs are turned each or all together.
     Raises:
-      UserError: a value that its setting does not take.
+      UserError: a value that its setting does not take, or a grid of more than 10,000 settings.
     """
     sweep = config.sweep or plan_of(config)
     if config.bench.combine == "grid":
+        count = math.prod(len(values) for values in sweep.values())
+        if count > _MOST:
+            raise UserError(
+                f"[sweep]: got a grid of {count} settings, expected at most {_MOST}; "
+                'name fewer knobs or values in [sweep], or set bench.combine = "each"'
+            )
         ways: Iterator[dict[str, Any]] = (
             dict(zip(sweep, values, strict=True)) for values in itertools.product(*sweep.values())
         )
@@ -93,27 +105,37 @@ def settings_of(config: Config) -> list[Setting]:
 
 
 def plan_of(config: Config) -> dict[str, tuple[Any, ...]]:
-    """Every knob that trades error against time, memory or bytes, from coarse to fine about where it stands."""
+    """Every knob that trades error against time, memory or bytes, from coarse to fine about where it stands.
+
+    Knobs that have no effect, because a file or another setting says what they would, are left out.
+    """
     points, lightings, resolution = config.points.count, config.lightings.train, config.atlas.resolution
-    noise = config.transport.target_noise
     fewer = lambda count, least: tuple(count // part for part in _HALVINGS if count // part >= least)  # noqa: E731
     plan: dict[str, tuple[Any, ...]] = {
         "fit.bases": tuple(bases for bases in (4, 8, 16, 32, 64) if bases < 3 * lightings),
-        "fit.points": fewer(points, 4),
+        "fit.points": () if config.points.file else fewer(points, 4),
         "fit.ridge": ("auto", 0.0, 1e-4, 1e-2),
         "fit.space": ("linear", "gamma"),
         "fit.centre": ("none", "mean"),
         "fit.channels": ("mono", "multi"),
         "fit.method": tuple(METHODS),
         "export.precision": ("half", "float"),
-        "lightings.train": (*fewer(lightings, 4), 2 * lightings),
-        "transport.target_noise": tuple(min(1.0, noise * factor) for factor in (8, 4, 2, 0.5)),
-        "transport.sender_resolution": (32, 64, 128),
+        "lightings.train": () if config.lightings.file else (*fewer(lightings, 4), 2 * lightings),
+        **_rays(config),
+        "transport.sender_resolution": (32, 64, 128) if config.transport.integrator in ("auto", "operator") else (),
         "transport.bounces": (1, 2, 4),
-        "points.supersample": (1, 2, 4, 8, 16),
+        "points.supersample": () if config.points.file else (1, 2, 4, 8, 16),
         "atlas.resolution": (*fewer(resolution, 32)[1:], 2 * resolution) if resolution < 512 else fewer(resolution, 32),
     }
     return {key: values for key, values in plan.items() if values}
+
+
+def _rays(config: Config) -> dict[str, tuple[Any, ...]]:
+    """The knob of noise: what is aimed at, or the samples themselves where they are given."""
+    samples, noise = config.transport.samples, config.transport.target_noise
+    if samples == "auto":
+        return {"transport.target_noise": tuple(max(1e-4, min(1.0, noise * factor)) for factor in (8, 4, 2, 0.5))}
+    return {"transport.samples": tuple(sorted({max(1, samples // 4), max(1, samples // 2), min(65536, 2 * samples)}))}
 
 
 def _at(config: Config, key: str) -> Any:
@@ -127,5 +149,6 @@ def _spoken(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _digest(document: dict[str, Any]) -> str:
+def digest_of(document: Any) -> str:
+    """Hash of what JSON can say."""
     return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()[:12]

@@ -12,7 +12,7 @@ import numpy as np
 from ddprt.bench.planner import KNOBS, QUANTITIES, Place, Plan, Planner, Trial
 from ddprt.bench.settings import Setting, changed
 from ddprt.bench.timing import timed
-from ddprt.bench.trial import Workshop, about, environment
+from ddprt.bench.trial import Workshop, about, environment, why
 from ddprt.config import Config
 from ddprt.dataset.forecast import forecast
 from ddprt.dataset.store import Dataset
@@ -84,16 +84,22 @@ class Search:
                 + "; give one"
             )
         if config.fit.method != "svd-ridge":
-            raise UserError(f'fit.method: got "{config.fit.method}", expected "svd-ridge"; the planner counts its bases')
+            raise UserError(f'fit.method: got "{config.fit.method}", expected "svd-ridge", whose bases are counted; set it')
+        workshop.check(config)
         self.config, self.workshop = config, workshop
         self.base: Place = tuple(float(_value(config, knob)) for knob in KNOBS)
         values = [_around(config, knob, base) for knob, base in zip(KNOBS, self.base, strict=True)]
-        self.planner = Planner(self.base, values, BASES, _PRECISIONS, self.limits)
+        self.bases = tuple(
+            count for count in BASES if count > (config.fit.centre == "mean")
+        )  # the mean alone is another method
+        self.planner = Planner(self.base, values, self.bases, _PRECISIONS, self.limits)
 
     def run(self) -> Outcome:
         """Searches."""
         progress, planner = self.workshop.progress, self.planner
-        self._try(self._start())
+        start = self._start()
+        if start == self.base or not self._tried(start):
+            self._try(self.base)  # what hinders that is to be mended
         verified: dict[Plan, dict[str, float]] = {}
         while True:
             plan, chance = planner.next()
@@ -103,14 +109,10 @@ class Search:
             if tried:
                 verified[plan] = self._verify(plan)
                 continue
-            if planner.hopeless(chance) or len(planner.trials) >= self.config.tune.trials:
+            if planner.hopeless(chance) or len(planner.trials) + len(planner.barred) >= self.config.tune.trials:
                 break
             progress.say(f"next: {self._name(plan.place)}, a chance of {chance:.0%}")
-            try:
-                self._try(plan.place)
-            except UserError as error:
-                progress.say(f"left out: {error}")
-                planner.barred.add(plan.place)
+            self._tried(plan.place)
         if not verified:  # the best plan lies where no trial may be made any more
             plan = self._best_tried()
             verified[plan] = self._verify(plan)
@@ -139,12 +141,23 @@ class Search:
                 place = (*place[:knob], ladder[at], *place[knob + 1 :])
         return place
 
+    def _tried(self, place: Place) -> bool:
+        """Whether a place can be baked; one that cannot is left out from now on."""
+        try:
+            self._try(place)
+        except (UserError, MemoryError) as error:
+            self.workshop.progress.say(f"left out: {self._name(place)}: {why(error)}")
+            self.planner.barred.add(place)
+            return False
+        return True
+
     def _try(self, place: Place) -> None:
         """Bakes at a place, and scores all numbers of bases."""
         setting = self._setting(Plan(place, max(BASES), "float"))
         data, baked = self.workshop.bake(setting)
         model, fitted = self._fit(setting, data)
-        sizes = [count for count in _SCORED if count < model.relighter.report.bases] + [model.relighter.report.bases]
+        most = model.relighter.report.bases
+        sizes = [count for count in _SCORED if count in self.bases and count < most] + [most]
         shorter = [first_bases(model, count) for count in sizes]
         tallies = [self.workshop.yardstick.tally(stored(one, "half")) for one in shorter]
         errors = [_error(tally) for tally in tallies]
@@ -210,8 +223,8 @@ class Search:
 
     def _best_tried(self) -> Plan:
         places = [trial.place for trial in self.planner.trials]
-        plans = [Plan(*parts) for parts in product(places, BASES, _PRECISIONS)]
-        return max(plans, key=self._chance)
+        plans = [Plan(*parts) for parts in product(places, self.bases, _PRECISIONS)]
+        return max(plans, key=lambda plan: (self._chance(plan), -self.planner.guesses(plan)["relative_rmse"].mean))
 
 
 def tune(config: Config, folder: Path, progress: Any) -> Outcome:
@@ -306,11 +319,11 @@ def _around(config: Config, knob: str, base: float) -> tuple[float, ...]:
     )
     if still or (knob == "lightings.train" and config.lightings.file):
         return (base,)
-    steps = {max(_LEAST[knob], factor * base) for factor in _FACTORS[knob]}
+    steps = {max(_LEAST[knob], factor * base) for factor in _FACTORS[knob] if factor != 1}
     if knob == "transport.target_noise":
-        return tuple(sorted(min(1.0, float(f"{step:.3g}")) for step in steps))
+        return tuple(sorted({base, *(min(1.0, float(f"{step:.3g}")) for step in steps)}))
     if knob == "atlas.resolution":
-        return tuple(sorted({base, *(float(8 * round(step / 8)) for step in steps)}))
+        return tuple(sorted({base, *(step for each in steps if (step := float(8 * round(each / 8))) < base)}))
     return tuple(sorted({base, *(float(round(step)) for step in steps)}))
 
 

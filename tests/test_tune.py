@@ -1,0 +1,396 @@
+"""The search for a setting within a budget: on real small bakes, and its pure parts against what they are short for."""
+
+import json
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ddprt
+from ddprt.bench import trial as trials
+from ddprt.bench import tune as tuning
+from ddprt.bench.planner import KNOBS, QUANTITIES, Plan, Trial
+from ddprt.bench.settings import Setting, changed
+from ddprt.bench.trial import Workshop
+from ddprt.bench.tune import Outcome, Search, _around, first_bases, spread_of, told, tune, with_measured
+from ddprt.cli import main
+from ddprt.config import Config, checked, load_config
+from ddprt.dataset.store import Dataset
+from ddprt.errors import UserError
+from ddprt.files import alone_in
+from ddprt.progress import Progress
+from ddprt.report.metrics import Tally
+from ddprt.runtime.precision import shipped_bytes, stored
+from ddprt.runtime.train import fit_config
+
+SMALL = """
+[atlas]
+resolution = 32
+[lightings]
+train = 8
+validation = 2
+test = 4
+[points]
+count = 12
+supersample = 2
+[transport]
+samples = 8
+threads = 2
+[fit]
+bases = 4
+[bench]
+repeats = 1
+path_frames = 0
+pictures = 0
+noise = 0.3
+keep = true
+"""
+QUIET = Progress(quiet=True)
+
+
+def base(**changes: Any) -> Config:
+    return changed(checked(tomllib.loads(SMALL)), {key.replace("__", "."): value for key, value in changes.items()})
+
+
+def call(*words: object) -> int:
+    with pytest.raises(SystemExit) as stop:
+        main([str(word) for word in words])
+    return int(stop.value.code or 0)
+
+
+@pytest.fixture(scope="module")
+def tuned(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
+    """A search that a budget with room ends at once, and whose datasets stay."""
+    folder = tmp_path_factory.mktemp("tune")
+    return folder, tune(base(tune__max_relative_rmse=0.9, tune__max_megabytes=5.0), folder, QUIET)
+
+
+@pytest.fixture(scope="module")
+def data(tuned: tuple[Path, Outcome]) -> Dataset:
+    return Workshop(base(), tuned[0], QUIET).bake(Setting({}, base()))[0]
+
+
+def test_a_budget_with_room_is_met_in_one_trial(tuned: tuple[Path, Outcome]) -> None:
+    folder, outcome = tuned
+    assert outcome.met
+    assert outcome.trials == 1
+    assert outcome.chance > 0.9
+    assert set(outcome.reached) == set(QUANTITIES)
+    assert outcome.reached["relative_rmse"] <= 0.9
+    assert outcome.binding == "relative_rmse"
+    names = {path.name for path in folder.iterdir()}
+    assert {"tuned.toml", "trials.jsonl", "datasets"} <= names
+    assert "nearest.toml" not in names
+    (line,) = [json.loads(line) for line in (folder / "trials.jsonl").read_text().splitlines()]
+    assert {"trial", "bake", "environment", "config", "digest"} <= set(line)
+    assert line["trial"]["bases"] == sorted(line["trial"]["bases"])
+
+
+def test_what_is_written_makes_it_again(
+    tuned: tuple[Path, Outcome], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Through the command line, from nothing: the same error to the last digit, the same bytes."""
+    folder, outcome = tuned
+    written, run = folder / "tuned.toml", tmp_path / "run"
+    assert load_config(written) == outcome.setting.config
+    assert call("bake", written, "--out", run, "--quiet") == 0
+    assert call("fit", written, "--out", run, "--methods.compare", "['svd-ridge']", "--quiet") == 0
+    precision = load_config(written).export.precision
+    model = stored(ddprt.load_model(run / "model.ddprt"), precision)
+    truth = Workshop(base(), folder, QUIET).yardstick
+    assert truth.tally(model).scores()["relative_rmse"] == outcome.reached["relative_rmse"]
+    assert shipped_bytes(model, precision) == round(1e6 * outcome.reached["megabytes"])
+
+
+def test_the_table_tells_the_trade(tuned: tuple[Path, Outcome]) -> None:
+    text = told(tuned[1])
+    assert "meets the budget: fit.bases = " in text
+    assert "the least room is left by relative_rmse" in text
+    assert [line.split()[0] for line in text.splitlines()[1:6]] == list(QUANTITIES)
+    assert "5 MB" in text
+    unsure = told(replace(tuned[1], chance=0.5))
+    assert "a chance of 50%" in unsure
+    assert "just so" not in text
+
+
+def test_a_search_that_was_stopped_bakes_nothing_again(tuned: tuple[Path, Outcome], monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, before = tuned
+
+    def forbidden(*_: Any, **__: Any) -> Dataset:
+        raise AssertionError("baked again")
+
+    monkeypatch.setattr(trials, "bake", forbidden)
+    after = tune(base(tune__max_relative_rmse=0.9, tune__max_megabytes=5.0), folder, QUIET)
+    assert after.reached["relative_rmse"] == before.reached["relative_rmse"]
+    assert after.reached["bake_seconds"] == before.reached["bake_seconds"]
+    assert len((folder / "trials.jsonl").read_text().splitlines()) == 1, "those of the search before are not mixed in"
+
+
+def test_what_cannot_be_met_is_one_line_and_a_configuration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    job, folder = tmp_path / "job.toml", tmp_path / "run" / "tune"
+    job.write_text(SMALL.replace("keep = true", ""))
+    words = ["--out", tmp_path / "run", "--max-relative-rmse", "1e-4", "--max-frame-us", "1e9", "--tune.trials", "1", "--quiet"]
+    folder.mkdir(parents=True)
+    (folder / "tuned.toml").write_text("of an earlier budget")
+    assert call("tune", job, *words) == 2
+    said = capsys.readouterr()
+    assert said.err.splitlines() == [
+        "ddprt: ddprt tune: got a budget that no setting meets, relative_rmse stands in the way; "
+        f"raise --max-relative-rmse, or take {folder / 'nearest.toml'}"
+    ]
+    assert "no setting meets the budget; relative_rmse stands in the way; nearest: " in said.out
+    assert "after 1 bakes" in said.out
+    assert sorted(path.name for path in folder.iterdir()) == ["nearest.toml", "trials.jsonl"]
+    assert load_config(folder / "nearest.toml").tune.max_relative_rmse == 1e-4
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "ddprt tune: got no limit, expected at least one of --max-relative-rmse, --max-frame-us, --max-megabytes"),
+        (["--max-frame-us", "0"], "got no limit"),
+        (["--max-frame-us", "-1"], "max_frame_us: got -1, expected greater than or equal to 0"),
+        (["--max-frame-us", "fast"], "max_frame_us: got 'fast', expected number"),
+        (["--max-frame-us", "nan"], "max_frame_us: got nan, expected a finite number"),
+        (["--max-frame-us"], "--max-frame-us: got no value"),
+        (["--max-frame-us="], "--max-frame-us: got an empty value"),
+        (["--max-frames", "3"], '--max-frames: unknown option; did you mean "max-frame-us"?'),
+        (["--max-frame-us", "9", "--tune.trials", "0"], "--tune.trials: got 0"),
+        (["--max-frame-us", "9", "--fit.method", "mean"], 'fit.method: got "mean", expected "svd-ridge"'),
+        (["--max-frame-us", "9", "--methods.compare", "['svd']"], 'no method "svd"'),
+        (["--max-frame-us", "9", "--lightings.target_error", "1"], "lightings.target_error: got 1, expected 0"),
+        (["--max-frame-us", "9", "--points.count", "4000"], "points.count: got 4000, but"),
+        (["--max-frame-us", "9", "--points.file", "no.json"], "no.json"),
+        (["--max-frame-us", "9", "--lightings.file", "no.json"], "no.json"),
+        (["--max-relative-rmse", "1", "--transport.bounces", "0"], "without indirect light"),
+    ],
+)
+def test_wrong_words_are_one_line(words: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    job = tmp_path / "job.toml"
+    job.write_text(SMALL)
+    assert call("tune", job, "--out", tmp_path / "run", "--quiet", *words) == 2
+    said = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning: ")]
+    assert len(said) == 1
+    assert message in said[0]
+    assert "our fault" not in said[0]
+
+
+def test_two_searches_at_once_are_one_too_many(tmp_path: Path) -> None:
+    with alone_in(tmp_path), pytest.raises(UserError, match="working in this folder"):
+        tune(base(tune__max_frame_us=1e9), tmp_path, QUIET)
+
+
+# --- searches whose bakes are stood in for ---
+
+
+class Bench:
+    """Stands in for bakes: which places were asked for, and which of them can be made."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, works: Any = lambda place: True) -> None:
+        self.asked: list[tuple[float, ...]] = []
+
+        def fake(search: Search, place: tuple[float, ...]) -> None:
+            self.asked.append(place)
+            if not works(place):
+                raise UserError("points.count: got too many")
+            size = place[0] / search.base[0]
+            error = 0.5 / size**0.3 * (search.base[1] / place[1]) ** 0.4
+            curve = (error * 1.5, error)
+            half = (size**2, 2 * size**2)
+            search.planner.add(
+                Trial(place, (4, 16), curve, 0.05, (10.0, 20.0), {"half": half, "float": half}, 10 * size**1.5, 1.0)
+            )
+
+        def verify(search: Search, plan: Plan) -> dict[str, float]:
+            return {name: float(np.exp(guess.mean)) for name, guess in search.planner.guesses(plan).items()}
+
+        monkeypatch.setattr(Search, "_try", fake)
+        monkeypatch.setattr(Search, "_verify", verify)
+
+
+def searching(tmp_path: Path, **changes: Any) -> Search:
+    config = base(**changes)
+    return Search(config, Workshop(config, tmp_path, QUIET))
+
+
+def test_places_that_cannot_be_baked_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    search = searching(tmp_path, tune__max_relative_rmse=0.42)
+    bench = Bench(monkeypatch, lambda place: place[3] <= 12)
+    outcome = search.run()
+    assert outcome.met
+    assert len(bench.asked) == len(set(bench.asked)), "nothing is tried twice"
+    assert search.planner.barred == {place for place in bench.asked if place[3] > 12}
+    assert outcome.trials == len(bench.asked) - len(search.planner.barred)
+
+
+def test_where_only_the_base_can_be_baked_it_is_the_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    search = searching(tmp_path, tune__max_relative_rmse=0.42)
+    bench = Bench(monkeypatch, lambda place: place == search.base)
+    outcome = search.run()
+    assert not outcome.met
+    assert outcome.plan.place == search.base
+    assert outcome.trials == 1
+    assert len(bench.asked) <= 12, "tries that fail are tries, too"
+
+
+def test_a_mean_counts_as_a_basis_and_is_none_alone(tmp_path: Path) -> None:
+    """A fit refuses it, so that a search may not come to ask for it."""
+    assert min(searching(tmp_path, tune__max_frame_us=1.0).planner.bases) == 1
+    assert min(searching(tmp_path, tune__max_frame_us=1.0, fit__centre="mean").planner.bases) == 2
+
+
+@pytest.mark.parametrize("works", [True, False])
+def test_a_base_that_takes_too_long_is_begun_below(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, works: bool) -> None:
+    expected = SimpleNamespace(training_seconds=1000.0)
+    monkeypatch.setattr(tuning, "forecast", lambda *_: expected)
+    search = searching(tmp_path, tune__max_bake_seconds=20.0, transport__samples="auto", transport__target_noise=0.012345)
+    bench = Bench(monkeypatch, lambda place: works or place == search.base)
+    assert search.run().met
+    assert bench.asked[0] != search.base
+    assert all(value in values for value, values in zip(bench.asked[0], search.planner.values, strict=True))
+    assert (search.base in bench.asked) >= (not works), "what is coarser cannot be baked: the base is tried instead"
+
+
+def test_of_plans_that_are_as_far_off_the_nearest_errs_least(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    search = searching(tmp_path, tune__max_bake_seconds=1e-3, tune__trials=1)
+    Bench(monkeypatch)
+    monkeypatch.setattr(Search, "_start", lambda search: search.base)
+    outcome = search.run()
+    assert outcome.binding == "bake_seconds"
+    assert outcome.plan.bases >= 16, "the bake costs the same, however many bases are kept"
+
+
+def test_no_more_bakes_than_allowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    search = searching(tmp_path, tune__max_relative_rmse=0.3, tune__trials=2)
+    bench = Bench(monkeypatch)
+    assert search.run().trials <= 2
+    assert len(bench.asked) <= 2
+
+
+# --- pure parts ---
+
+
+@pytest.mark.parametrize("knob", KNOBS)
+@pytest.mark.parametrize("value", [2, 12, 16, 20, 32, 100, 181, 0.0005, 0.012345, 0.3, 1.0])
+def test_a_knob_can_stay_where_it_is(knob: str, value: float) -> None:
+    noise = knob == "transport.target_noise"
+    if noise != (value <= 1) or (knob == "atlas.resolution" and value < 8):
+        return
+    config = changed(Config(), {knob: value})
+    values = _around(config, knob, float(value))
+    assert value in values
+    assert list(values) == sorted(set(values))
+    for each in values:
+        changed(config, {knob: each if noise else round(each)})  # its setting takes it
+    if knob == "atlas.resolution":
+        assert max(values) == value, "never finer than the truth"
+
+
+@pytest.mark.parametrize(
+    ("changes", "still"),
+    [
+        ({"transport.samples": 8}, "transport.target_noise"),
+        ({"points.file": "a.json"}, "points.count"),
+        ({"lightings.file": "a.json"}, "lightings.train"),
+    ],
+)
+def test_knobs_without_effect_are_not_turned(changes: dict[str, Any], still: str) -> None:
+    config = changed(Config(), changes)
+    for knob in KNOBS:
+        assert (len(_around(config, knob, tuning._value(config, knob))) == 1) == (knob == still)
+
+
+@pytest.mark.parametrize("centre", ["none", "mean"])
+@pytest.mark.parametrize(("channels", "space"), [("mono", "linear"), ("multi", "gamma")])
+def test_first_bases_are_a_fit_with_fewer(data: Dataset, centre: str, channels: str, space: str) -> None:
+    how = {"fit.centre": centre, "fit.channels": channels, "fit.space": space, "fit.ridge": 1e-3}
+    whole = fit_config(data, base(**{"fit.bases": 7, **how}), "svd-ridge")
+    values = data.values(data.split("validation"), whole.points, whole.quantity)
+    for count in (2 if centre == "mean" else 1, 3, whole.relighter.report.bases):
+        fewer = fit_config(data, base(**{"fit.bases": count, **how}), "svd-ridge")
+        short = first_bases(whole, count)
+        assert short.relighter.report.bases == fewer.relighter.report.bases == count
+        assert shipped_bytes(short, "half") == shipped_bytes(fewer, "half")
+        light = fewer.predict(values)
+        # The same vectors and columns, added up in another order: some ten float32 roundings of the largest value, times
+        # the encoding's steepness, which near black is unbounded in gamma space only for what is far below that value.
+        assert np.abs(short.predict(values) - light).max() <= 1e-5 * light.max()
+    assert np.abs(first_bases(whole, 2).predict(values) - whole.predict(values)).max() > 1e-3 * whole.predict(values).max()
+
+
+def tally(error: np.ndarray, mean: np.ndarray) -> Tally:
+    count = len(error)
+    flat = np.repeat(mean[:, None], 3, 1)
+    return Tally(error, error, flat, flat, np.ones(count, np.float32))
+
+
+def log_error(error: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    return 0.5 * np.log(error.mean(-1)) - np.log(mean.mean(-1))
+
+
+def test_spread_agrees_with_a_bootstrap() -> None:
+    rng = np.random.default_rng(0)
+    count, draws = 200, 4000
+    error, mean = rng.lognormal(0, 0.5, count), rng.lognormal(0, 0.3, count)
+    error *= mean**2  # brighter lightings err more, which a ratio partly takes out
+    rows = rng.integers(0, count, (draws, count))
+    bootstrap = float(log_error(error[rows], mean[rows]).std())
+    # A standard deviation of 4000 draws is known to 1 / sqrt(8000) = 1.1 %, five of which are 5.6 %; the two differ by
+    # sqrt(199 / 200) and terms of second order, of a share 1 / 200 each.
+    assert spread_of(tally(error, mean)) == pytest.approx(bootstrap, rel=0.056 + 0.0025 + 0.01)
+
+
+def test_spread_of_two_is_half_their_difference() -> None:
+    error, mean = np.array([0.04, 0.25]), np.array([1.0, 2.0])
+    # Leaving one out leaves the other: logs a and b, sqrt(1/2 * 2 * ((a - b) / 2)²).
+    first, second = log_error(error[:1], mean[:1]), log_error(error[1:], mean[1:])
+    assert spread_of(tally(error, mean)) == pytest.approx(abs(first - second) / 2, rel=1e-12)
+
+
+def test_spread_knows_no_units_and_nothing_of_one_lighting() -> None:
+    rng = np.random.default_rng(1)
+    error, mean = rng.lognormal(size=9), rng.lognormal(size=9)
+    assert spread_of(tally(error * 1e-20, mean * 1e9)) == pytest.approx(spread_of(tally(error, mean)), rel=1e-9)
+    assert spread_of(tally(np.ones(5), np.ones(5))) == pytest.approx(0, abs=1e-12)
+    assert spread_of(tally(error[:1], mean[:1])) == 1
+    assert spread_of(tally(np.zeros(5), np.ones(5))) == 1
+
+
+def test_a_measurement_takes_its_place_on_the_curves() -> None:
+    place = (32.0, 8.0, 0.01, 12.0)
+    sizes = {"half": (1.0, 2.0, 4.0), "float": (2.0, 4.0, 8.0)}
+    known = Trial(place, (2, 4, 8), (0.3, 0.2, 0.1), 0.05, (10.0, 11.0, 12.0), sizes, 7.0, 3.0)
+    reached = {"relative_rmse": 0.15, "frame_us": 20.0, "megabytes": 2.9, "bake_seconds": 99.0, "fit_seconds": 5.0}
+    between = with_measured(known, Plan(place, 6, "half"), reached, 0.5)
+    assert between.bases == (2, 4, 6, 8)
+    assert between.errors == (0.3, 0.2, 0.15, 0.1)
+    assert between.frame_us == (10.0, 11.0, 20.0, 12.0)
+    assert between.megabytes == {"half": (1.0, 2.0, 2.9, 4.0), "float": (2.0, 4.0, 6.0, 8.0)}
+    assert (between.error_spread, between.bake_seconds, between.fit_seconds) == (0.5, 7.0, 5.0)
+    there = with_measured(known, Plan(place, 4, "float"), reached, 0.5)
+    assert there.bases == known.bases
+    assert there.errors == (0.3, 0.15, 0.1)
+    assert there.megabytes == {"half": (1.0, 2.0, 4.0), "float": (2.0, 2.9, 8.0)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"scene__name": "furnace", "scene__parameters": {"subdivisions": 2}},
+        {"scene__name": "corridor"},
+        {"scene__name": "statue", "scene__parameters": {"subdivisions": 2}, "lightings__distribution": "around"},
+        {"lightings__choose": "active", "points__choose": "qr"},
+        {"fit__centre": "mean", "fit__channels": "multi", "fit__space": "gamma"},
+        {"atlas__resolution": 24, "lightings__train": 2, "points__count": 2},
+    ],
+    ids=["furnace", "corridor", "statue", "chosen", "multi", "tiny"],
+)
+def test_other_scenes_and_ways_are_tuned(changes: dict[str, Any], tmp_path: Path) -> None:
+    outcome = tune(base(**changes, tune__max_relative_rmse=50.0, tune__max_bake_seconds=600.0), tmp_path, QUIET)
+    assert outcome.met
+    assert load_config(tmp_path / "tuned.toml") == outcome.setting.config
