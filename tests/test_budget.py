@@ -5,12 +5,14 @@ All budgets of this file share their bakes next to free of noise, so that what d
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from ddprt.bench import best_fit
 from ddprt.bench.advice import record, turn, weigh_knobs
 from ddprt.bench.best_fit import best_transfer, projected, same_fit
 from ddprt.bench.budget import CAUSES, Budget, measure_budget, table
@@ -19,13 +21,14 @@ from ddprt.bench.budget_bakes import Bakery
 from ddprt.config import load_config
 from ddprt.errors import UserError
 from ddprt.export.textures import LAYER, export_textures
+from ddprt.fitting.transfer import fit_transfer
 from ddprt.pipeline import Run
 from ddprt.runtime.model import Model
 from ddprt.runtime.precision import PRECISIONS, shipped_bytes, stored
 from ddprt.scene.exr import read_exr
 
 SMALL = {
-    "atlas.resolution": "32",
+    "atlas.resolution": "24",
     "lightings.train": "24",
     "lightings.validation": "3",
     "lightings.test": "2",
@@ -41,7 +44,7 @@ SMALL = {
     "budget.lightings": "12",
     "budget.noise": "0.02",
     "budget.abundance": "3",
-    "budget.truth_samples": "1024",
+    "budget.truth_samples": "256",
     "budget.shadow_map": "256",
 }
 NOTHING_BUT = {  # what a setting of the shipped model or its fit may move beside its own part
@@ -68,7 +71,7 @@ class Workshop:
             run = Run(config, self.folder / baked, quiet=True)
             data = run.bake()
             model = run.fit(data)[0][config.fit.method]
-            bakery = Bakery(run.scene, config, data, self.folder / "budget", run.progress)
+            bakery = Bakery(run.scene, config, data, self.folder / f"budget-{config.seed}", run.progress)
             self.made[key] = measure_budget(model, bakery), model, bakery
         return self.made[key]
 
@@ -135,6 +138,7 @@ def test_projection_is_orthogonal_to_its_span(workshop: Workshop) -> None:
         assert abs(products[i, last]) < 4 * 2**-24 * np.sqrt(whole) * (np.sqrt(products[i, i]) + np.sqrt(products[last, last]))
 
 
+@pytest.mark.slow
 def test_parts_close(workshop: Workshop) -> None:
     """Cross terms stay within 5 %, by three standard errors of the mean over seeds, none of which was picked."""
     budgets = [workshop(seed=seed)[0] for seed in range(3)]
@@ -144,11 +148,12 @@ def test_parts_close(workshop: Workshop) -> None:
     assert abs(closures.mean() - 1) < 0.05 + 3 * np.hypot(spread, chance)
 
 
-def test_best_transfer_leaves_nothing_linear(workshop: Workshop) -> None:
-    """Over all that it is fitted on, what it leaves has no product with what another transfer on the same basis answers."""
+def test_best_transfer_leaves_nothing_linear(workshop: Workshop, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a ridge, and over all that it is fitted on, what it leaves has no product with what another transfer on the same basis answers."""
     budget, model, bakery = workshop()
     config = bakery.config
     parts = budget.yardsticks.unseen()
+    monkeypatch.setattr(best_fit, "fit_transfer", partial(fit_transfer, ridge=0.0))
     values = np.concatenate([data.values(indices, model.points, model.quantity) for data, indices in parts])
     light = np.concatenate([data.maps("indirect", indices) for data, indices in parts])
     best = best_transfer(model, *parts).predict(values, clamp=False)
@@ -156,10 +161,9 @@ def test_best_transfer_leaves_nothing_linear(workshop: Workshop) -> None:
     chain = [Link.sure("one", other.predict(values, clamp=False)), Link.sure("two", best)]
     products = take_apart([*chain, Link.sure("", projected(model, values, light))], budget.weight).products
     one, two = products[0, 0], products[1, 1]
-    assert set(map(len, (parts, budget.yardsticks.unseen()))) == {2}
     assert not set(parts[0][1]) & set(budget.yardsticks.clean.split("train")[: budget.yardsticks.train])
-    # A ridge chosen by leaving one out shortens what is answered a little; without one the product is rounding alone.
-    assert abs(products[0, 1]) < 1e-2 * np.sqrt(one * two)
+    # Matrices are float32: answers are off by 2^-24 (6e-8) of what their terms cancel, for which there is room a hundredfold.
+    assert abs(products[0, 1]) < 100 * 2**-24 * np.sqrt(one * two)
 
 
 def test_noise_to_the_basis_is_noise(workshop: Workshop) -> None:
@@ -184,7 +188,9 @@ def test_noise_reacts_to_noisy_maps_alone(workshop: Workshop) -> None:
     grown = noisy.parts.part("noise") - plain.parts.part("noise")
     others = moved(plain, noisy) - NOTHING_BUT["noise"]
     # Those stand on the noisy basis: they move with it, but less by an order of magnitude than what they are not about.
-    assert others <= {"regularisation", "measurement", "operator bias"}
+    assert others <= {"regularisation", "measurement", "operator bias", "truncation"}
+    clean = [budget.parts.part("truncation") for budget in (plain, noisy)]
+    assert clean[1] == pytest.approx(clean[0], rel=1e-12)  # taken out of another square: the same but for float64 rounding
     assert sum(abs(noisy.parts.part(cause) - plain.parts.part(cause)) for cause in others) < 0.1 * grown
 
 
