@@ -16,8 +16,8 @@ from ddprt.bench import best_fit
 from ddprt.bench.advice import record, turn, weigh_knobs
 from ddprt.bench.best_fit import best_transfer, projected, same_fit
 from ddprt.bench.budget import CAUSES, Budget, measure_budget, table
-from ddprt.bench.chain import Link, squared_error, take_apart
 from ddprt.bench.budget_bakes import Bakery
+from ddprt.bench.chain import Link, squared_error, take_apart
 from ddprt.config import load_config
 from ddprt.errors import UserError
 from ddprt.export.textures import LAYER, export_textures
@@ -149,7 +149,7 @@ def test_parts_close(workshop: Workshop) -> None:
 
 
 def test_best_transfer_leaves_nothing_linear(workshop: Workshop, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a ridge, and over all that it is fitted on, what it leaves has no product with what another transfer on the same basis answers."""
+    """Without a ridge, over all that it is fitted on: what it leaves has no product with another transfer's answers."""
     budget, model, bakery = workshop()
     config = bakery.config
     parts = budget.yardsticks.unseen()
@@ -172,7 +172,9 @@ def test_noise_to_the_basis_is_noise(workshop: Workshop) -> None:
     parts = budget.parts
     i, j = (parts.causes.index(cause) for cause in ("truncation", "noise"))
     left = [
-        take_apart([Link("", tuple(projected(m, budget.values, h) for h in budget.truth)), Link("", budget.truth)], budget.weight)
+        take_apart(
+            [Link("", tuple(projected(m, budget.values, h) for h in budget.truth)), Link("", budget.truth)], budget.weight
+        )
         for m in (budget.model, budget.clean)
     ]
     gross, clean = (float(one.products.sum()) for one in left)
