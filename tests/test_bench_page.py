@@ -81,14 +81,14 @@ def example(changes: dict[str, Any], order: int) -> dict[str, Any]:
         "psnr_db": -20 * math.log10(error) + 14,
         "pu21_psnr_db": -20 * math.log10(error) + 21 + 0.3 * jitter(),
         "flip": flip,
-        "flip_missing": "the scene has no camera" if flip is None else "",
+        "flip_reason": "the scene has no camera" if flip is None else "",
         "energy_bias": -0.1 * error,
         "median_lighting_relative_rmse": 0.7 * error,
         "p90_lighting_relative_rmse": 1.6 * error,
         "worst_lighting_relative_rmse": 3.2 * error * jitter(),
         "negative_share": 0.002,
         "flicker": 0.0 if method == "mean" else 0.2 * error * jitter(),
-        "unseen": 0,
+        "unseen_lightings": 0,
     }
     name = ", ".join(f"{key} = {value:g}" if isinstance(value, float) else f"{key} = {value}" for key, value in changes.items())
     linear = method == "svd-ridge"
@@ -409,7 +409,7 @@ def test_ticks_are_few_rise_and_are_told_apart(form: str, start: float, decades:
 
 def test_ticks_say_what_they_are() -> None:
     assert [text for _, text in ticks(0.9 * 2**18, 1.1 * 2**22, "bytes")] == ["256 KiB", "512 KiB", "1 MiB", "2 MiB", "4 MiB"]
-    assert ticks(0.009, 0.11, "percent") == [(0.01, "1\u00a0%"), (0.02, "2\u00a0%"), (0.05, "5\u00a0%"), (0.1, "10\u00a0%")]
+    assert ticks(0.009, 0.11, "percent") == [(0.01, "1\u00a0%"), (0.03, "3\u00a0%"), (0.1, "10\u00a0%")]
     assert [text for _, text in ticks(0.001, 0.1, "decibel")] == ["60 dB", "50 dB", "40 dB", "30 dB", "20 dB"]
     assert [text for _, text in ticks(9e-6, 2e-2, "seconds")] == ["10 µs", "100 µs", "1 ms", "10 ms"]
 
@@ -436,16 +436,37 @@ def test_figures_are_a_column_wide_and_their_text_is_text(cost: str, folder: Pat
 
 
 def test_fronts_are_drawn_as_steps_through_their_settings(found: Sweep) -> None:
-    """Upright at the cost of each setting and where the axis ends."""
+    """Upright at the cost of each setting and where the axis ends; there it comes down to that setting's error."""
     for cost in DRAWN:
         (line,) = re.findall(
             r'<path d="([^"]*)"[^>]*stroke: #24292f; stroke-width: 0.9; stroke-linecap: square', found.figure(cost)
         )
         places = np.array([[float(number) for number in pair] for pair in re.findall(r"[ML] (\S+) (\S+)", line)])
         assert (np.diff(places, axis=0) == 0).any(1).all(), "every stretch is level or upright"
-        assert len(np.unique(places[:, 0])) == len(pareto.path(*found.pair("error", cost))) + 1
-        assert (np.diff(places[:, 0]) >= 0).all()
-        assert (np.diff(places[:, 1]) >= 0).all(), "downwards on paper"
+        assert (np.diff(places, axis=0) >= 0).all(), "to the right, and downwards on paper"
+        costs, errors = found.pair("error", cost)
+        logarithms = np.log([errors[index] for index in pareto.path(costs, errors)])
+        across = np.unique(places[:, 0])[:-1]
+        assert len(across) == len(logarithms)
+        down = np.array([places[places[:, 0] == x, 1].max() for x in across])
+        # six decimals are written, of points; the front spans more than 10 of them
+        expected = (logarithms - logarithms[0]) / (logarithms[-1] - logarithms[0])
+        np.testing.assert_allclose((down - down[0]) / (down[-1] - down[0]), expected, rtol=0, atol=4 * 0.5e-6 / 10)
+
+
+def test_dollars_in_a_name_are_no_formula() -> None:
+    sweep = bent([(1, 0.5), (10, 0.005), (1e4, 0.0005)])
+    sweep.settings[1]["name"] = "$x_1$ = 2"
+    assert "knee: $x_1$ = 2" in written(sweep.figure("bake"))
+
+
+def test_axes_hold_the_bars() -> None:
+    sweep = bent([(1, 0.5), (2, 0.4)])
+    for record, low, high in zip(sweep.settings, (1e-9, 1e-5), (1e-3, 50.0), strict=True):
+        record["frame"] |= {"low": low, "high": high}
+    axis = sweep.axis(COSTS["frame"])
+    assert axis.low < 1e-9
+    assert axis.high > 50
 
 
 def test_labels_lie_apart_and_inside(found: Sweep, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -453,12 +474,13 @@ def test_labels_lie_apart_and_inside(found: Sweep, monkeypatch: pytest.MonkeyPat
     placed = fronts._placed
 
     def watched(axes: Any, cloud: Any, index: int, text: str, frame: Any, taken: list[Any]) -> bool:
+        before = len(taken)
         done = placed(axes, cloud, index, text, frame, taken)
         if done:
-            box = taken[-1]
+            box = taken[before]
             assert frame.x0 <= box.x0 < box.x1 <= frame.x1
             assert frame.y0 <= box.y0 < box.y1 <= frame.y1
-            assert not any(box.overlaps(other) for other in taken[:-1])
+            assert not any(box.overlaps(other) for other in taken[:before])
             boxes.append(box)
         return done
 
@@ -566,10 +588,14 @@ def test_page_works_in_a_browser(page: str, found: Sweep, tmp_path: Path) -> Non
 def test_a_wicked_name_runs_nothing(tmp_path: Path) -> None:
     records = [example({}, 0), {**example({"scene.name": "x"}, 1), "name": "<img src=x onerror=document.title='run'>"}]
     wicked = write_page(tmp_path / "page.html", records, title="</script><script>document.title='run'</script>")
+    hover = "document.querySelectorAll('a[data-index=\"1\"]')[0].dispatchEvent(new PointerEvent('pointerenter'))"
+    text = wicked.read_text("utf-8").replace("</body>", f"<script>setTimeout(() => {hover}, 200)</script></body>")
+    wicked.write_text(text, "utf-8")
     dumped = browsed(wicked, tmp_path / "profile")
     assert "<title>run" not in dumped
+    assert "<strong>&lt;img src=x" in dumped, "what is pointed at is named as text"
     assert "<img src=" not in dumped.split("<noscript>")[0]
-    assert len(re.findall(r'data-index="\d', dumped)) == 8
+    assert len(re.findall(r'<a [^>]*data-index="\d', dumped)) == 8
 
 
 if __name__ == "__main__":

@@ -17,8 +17,9 @@ from ddprt.errors import UserError
 from ddprt.methods.method import STATUSES
 from ddprt.report import figures
 from ddprt.report.evaluate import Evaluation, bases_curve, evaluate, spot_check
-from ddprt.report.page import _bytes, _count, _percent, _seconds, _short, method_table, warnings, write_page
+from ddprt.report.page import _short, method_table, warnings, write_page
 from ddprt.report.view import Camera, default_camera, first_fronts, seen, take_view
+from ddprt.report.words import count, percent, seconds, size
 from ddprt.runtime.model import Model
 from ddprt.runtime.train import fit_config
 from ddprt.scene.atlas import Atlas
@@ -317,7 +318,7 @@ def test_page_is_whole_and_needs_nothing_else(page: str) -> None:
 def test_page_says_what_was_found(job: Job, page: str) -> None:
     text = " ".join("".join(outline(page).texts).split())
     score = job.evaluation.metrics["methods"]["svd-ridge"]
-    assert f"is off by {_percent(score['relative_rmse'])} (relative RMSE)".replace("\u00a0", " ") in text.replace("\u00a0", " ")
+    assert f"is off by {percent(score['relative_rmse'])} (relative RMSE)".replace("\u00a0", " ") in text.replace("\u00a0", " ")
     assert "1.5 M" in text  # rays per second
     assert "texels seen 7" in text
     assert "ddprt run <tiny>.toml" in text
@@ -390,9 +391,9 @@ def test_methods_are_sorted_by_error_and_complete(job: Job) -> None:
 
 
 def test_numbers_for_people() -> None:
-    shown = [_percent(0.0481), _percent(0.2), _percent(2.0), _percent(None), _seconds(6.3e-4), _seconds(0), _seconds(12.3)]
+    shown = [percent(0.0481), percent(0.2), percent(2.0), percent(None), seconds(6.3e-4), seconds(0), seconds(12.3)]
     assert [text.replace("\u00a0", " ") for text in shown] == ["4.81 %", "20.0 %", "200 %", "–", "630 µs", "0 s", "12.3 s"]
-    assert [_bytes(512), _bytes(2**20), _count(2.5e6), _short(1.16e16), _short(0.25), _short("x")] == [
+    assert [size(512), size(2**20), count(2.5e6), _short(1.16e16), _short(0.25), _short("x")] == [
         "512 B", "1.0 MiB", "2.5 M", "1.16·10¹⁶", "0.25", "x",
     ]  # fmt: skip
 

@@ -144,7 +144,8 @@
     const onFront = new Set(pair.front);
     const order = places.map((_, index) => index).filter((index) => places[index]);
     const rank = (index) => (onFront.has(index) ? 2 : index === data.base ? 1 : 0);
-    order.sort((a, b) => rank(a) - rank(b));
+    const layer = (index) => (index === data.base ? 3 : rank(index));
+    order.sort((a, b) => layer(a) - layer(b));
     for (const index of order) {
       const setting = data.settings[index];
       const marker = data.markers[setting.kind];
@@ -157,7 +158,10 @@
       link.setAttribute("aria-label", `${setting.name}: ${setting.errors[up][1]}, ${setting.costs[across][1]}`);
       make("circle", { class: "target", cx: px, cy: py, r: 9 }, link);
       const [, , low, high] = setting.costs[across];
-      if (low > 0 && high > low) make("line", { class: "spread", x1: atX(low), x2: atX(high), y1: py, y2: py }, link);
+      if (low > 0 && high > low) {
+        make("line", { class: "spread", x1: atX(low), x2: atX(high), y1: py, y2: py }, link);
+        taken.push({ x0: atX(low), x1: atX(high), y0: py - 1, y1: py + 1 });
+      }
       make("polygon", { points: outline(marker, px, py, best ? 6.5 : 4.5) }, link);
       make("circle", { class: "halo", cx: px, cy: py, r: 10 }, link);
       taken.push(about(px, py, best ? 6 : 4));

@@ -17,13 +17,13 @@ from ddprt import __version__
 from ddprt.bench import pareto
 from ddprt.bench.pareto import COSTS, DRAWN, ERRORS, Form, Leg, Measure, Record
 from ddprt.files import make_folder, write_text
+from ddprt.report import words
 from ddprt.report.fronts import SHAPES, STAR, Axis, Cloud, front_figure, marker
-from ddprt.report.page import _bytes, _count, _percent, _seconds
 
 PAGE, TABLE = "frontier.html", "frontier.csv"
 BASE, SEVERAL = "as configured", "several knobs at once"
 _ROOM, _TINY = 0.08, 1.5  # free part at each end of an axis, and the least ratio of its ends
-_FEWEST, _MOST = 4, 6  # ticks
+_FEWEST, _MOST = 3, 6  # ticks
 _FLAT = 1e4  # a tenth of the error for so many times the cost is as good as never
 _MANTISSAS = ((1,), (1, 3), (1, 2, 5), (1, 1.5, 2, 3, 5, 7), tuple(i / 10 for i in range(10, 100)))
 _BINARY = ((1,), (1, 1.5), (1, 1.25, 1.5, 1.75), tuple(1 + i / 16 for i in range(16)))
@@ -118,7 +118,7 @@ class Sweep:
         """What no setting can be seen to pass: noise of the held-out maps, and what the base's basis leaves."""
         named = {"noise": "noise floor", "projection": "projection floor"}
         found = [(text, pareto.number(self.base or {}, f"floors.{key}_relative_rmse")) for key, text in named.items()]
-        return [(f"{text} ({_percent(level)})", level) for text, level in found if level]
+        return [(f"{text} ({words.percent(level)})", level) for text, level in found if level]
 
     def axis(self, measure: Measure, more: Sequence[float] = ()) -> Axis:
         """An axis that holds all settings, the bars of their repeats, and more."""
@@ -245,7 +245,7 @@ class Sweep:
 
     def missing(self) -> list[str]:
         """Why a score is missing, each reason once."""
-        reasons = [record["scores"].get("flip_missing") for record in self.settings if record["scores"].get("flip") is None]
+        reasons = [record["scores"].get("flip_reason") for record in self.settings if record["scores"].get("flip") is None]
         return list(dict.fromkeys(f"HDR-FLIP: {reason}" for reason in reasons if reason))
 
     def _row(self, record: Record, on: list[str]) -> dict[str, Any]:
@@ -331,10 +331,10 @@ def _plain(measure: Measure, record: Record) -> str:
 
 def _say(value: float, form: Form) -> str:
     if form == "gib":
-        return _bytes(value * 2**30)
+        return words.size(value * 2**30)
     if form == "percent":
-        return _percent(value) if value >= 1e-3 else f"{100 * value:.2g}\u00a0%"
-    ways: Mapping[str, Any] = {"seconds": _seconds, "bytes": _bytes, "count": _count}
+        return words.percent(value) if value >= 1e-3 else f"{100 * value:.2g}\u00a0%"
+    ways: Mapping[str, Any] = {"seconds": words.seconds, "bytes": words.size, "count": words.count}
     return ways[form](value)
 
 

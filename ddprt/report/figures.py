@@ -4,7 +4,6 @@ Plots name their colours as CSS variables with a fallback, so that a page may tu
 the lightmap or the view holds nothing. Matplotlib is loaded when something is drawn.
 """
 
-import io
 import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -14,11 +13,11 @@ import numpy as np
 from ddprt.axes import Bool, Float, Float64
 from ddprt.dataset.store import Dataset
 from ddprt.methods.method import FitReport
+from ddprt.report.drawing import INK, blank, saved, style
 from ddprt.report.evaluate import Evaluation
 from ddprt.report.view import LUMINANCE, View, diverging, exposure_for, png, seen, signed_range, tonemap
 from ddprt.transport.embree import Tracer
 
-INK = {"ink": "#24292f", "muted": "#6e7781", "grid": "#d8dee4"}
 SERIES = {"first": "#1f5fa8", "second": "#b8501c", "third": "#2f7d4f"}
 CHANNELS = {"red": "#c0392b", "green": "#2f8f57", "blue": "#2c6fbf"}
 _LARGEST = 512  # pixels along a side of a lightmap's picture
@@ -155,8 +154,8 @@ def hero(
     share = limit / max(float(reference.mean()), 1e-300)
     titles = "direct", "direct + ours", "direct + reference", f"ours − reference, ±{100 * share:.0f} % of mean indirect"
     below = "direct lightmap", "indirect, ours", "indirect, reference", "difference"
-    with _style():
-        figure = _figure(12.0, 6.5 if view.camera.aspect <= 1 else 5.8)
+    with style():
+        figure = blank(12.0, 6.5 if view.camera.aspect <= 1 else 5.8)
         for axes, picture, label in zip(figure.subplots(2, 4).flat, [*rows[0], *rows[1]], [*titles, *below], strict=True):
             axes.imshow(picture, interpolation="lanczos" if axes.get_subplotspec().rowspan.start == 0 else "nearest")
             axes.set_title(label, fontsize=10)
@@ -167,7 +166,7 @@ def hero(
                 spine.set_visible(False)
         if title:
             figure.suptitle(title, fontsize=11)
-        return _save(figure, "png", dpi=120, facecolor="white")
+        return saved(figure, "png", dpi=120, facecolor="white")
 
 
 def eigenvalues(report: FitReport) -> str:
@@ -324,25 +323,25 @@ def plots(evaluation: Evaluation, reports: Mapping[str, FitReport], main: str) -
 
 def _scatter(ground: np.ndarray, places: np.ndarray, colours: Any, size: int) -> bytes:
     height, width = ground.shape[:2]
-    with _style():
-        figure = _figure(width / 100, height / 100, layout=None)
+    with style():
+        figure = blank(width / 100, height / 100, layout=None)
         axes = figure.add_axes((0, 0, 1, 1))
         axes.imshow(ground, extent=(0, 1, 1, 0), aspect="auto", interpolation="bicubic")
         axes.scatter(*places.T, c=colours, s=size, edgecolors="white", linewidths=0.5)
         axes.set(xlim=(0, 1), ylim=(1, 0))
         axes.set_axis_off()
-        return _save(figure, "png", dpi=200)
+        return saved(figure, "png", dpi=200)
 
 
 def _plot(name: str, draw: Callable[[Any], None]) -> str:
     """SVG text of one pair of axes, ready to stand in a page: no header, no fixed size, themed, and with its own ids."""
-    with _style({"svg.hashsalt": name}):
-        figure = _figure(4.6, 3.1, layout=None)  # fixed margins: laying out by measuring would draw everything twice
+    with style({"svg.hashsalt": name}):
+        figure = blank(4.6, 3.1, layout=None)  # fixed margins: laying out by measuring would draw everything twice
         axes = figure.add_axes((0.16, 0.15, 0.82, 0.81))
         draw(axes)
         if axes.get_yscale() == "log" and not axes.dataLim.y1 > 0:  # darkness has no logarithm
             axes.set_yscale("linear")
-        text = _save(figure, "svg", metadata={"Date": None, "Creator": None}).decode()
+        text = saved(figure, "svg", metadata={"Date": None, "Creator": None}).decode()
     text = re.sub(r"^.*?(?=<svg)|<metadata>.*?</metadata>|<style.*?</style>", "", text, flags=re.S)
     text = re.sub(r' (width|height)="[\d.]+pt"', "", text, count=2)
     text = re.sub(r"font-family: [^;]*;", "font-family: inherit;", text)
@@ -350,39 +349,6 @@ def _plot(name: str, draw: Callable[[Any], None]) -> str:
     for key, colour in {**INK, **SERIES, **CHANNELS}.items():
         text = text.replace(colour, f"var(--plot-{key}, {colour})")
     return text
-
-
-def _figure(width: float, height: float, layout: Any = "constrained") -> Any:
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout=layout)
-
-
-def _save(figure: Any, kind: str, **options: Any) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format=kind, **{"transparent": "facecolor" not in options, **options})
-    return buffer.getvalue()
-
-
-def _style(more: Mapping[str, Any] | None = None) -> Any:
-    from matplotlib import rc_context
-
-    quiet = {
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.grid": True,
-        "axes.axisbelow": True,
-        "grid.linewidth": 0.6,
-    }
-    colours = {f"{part}": INK["ink"] for part in ("text.color", "axes.labelcolor", "xtick.labelcolor", "ytick.labelcolor")}
-    lines = {
-        "axes.edgecolor": INK["muted"],
-        "xtick.color": INK["muted"],
-        "ytick.color": INK["muted"],
-        "grid.color": INK["grid"],
-    }
-    sizes = {"font.size": 8.5, "axes.labelsize": 8.5, "lines.linewidth": 1.5, "lines.markersize": 4.5, "svg.fonttype": "none"}
-    return rc_context({**quiet, **lines, **colours, **sizes, **(more or {})})
 
 
 def _mark(axes: Any, at: int, label: str, colour: str) -> None:

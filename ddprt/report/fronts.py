@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ddprt.report.figures import INK, _figure, _save, _style
+from ddprt.report.drawing import INK, blank, saved, style
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito's, told apart by all
 _GREY = "#9aa2aa"  # of what is dominated
@@ -131,15 +131,15 @@ def front_figure(cloud: Cloud, x: Axis, y: Axis, *, floors: Sequence[tuple[str, 
     used = sorted({kind for kind, cost, error in zip(cloud.kinds, cloud.costs, cloud.errors, strict=True) if cost * error > 0})
     legend = _ROW * -(-len(used) // _COLUMNS)
     height = _PLOT + legend
-    with _style({"svg.hashsalt": f"{x.title}/{y.title}", "font.size": 7, "axes.labelsize": 7, "axes.grid": False}):
-        figure = _figure(_WIDTH, height, layout=None)
+    with style({"svg.hashsalt": f"{x.title}/{y.title}", "font.size": 7, "axes.labelsize": 7, "axes.grid": False}):
+        figure = blank(_WIDTH, height, layout=None)
         FigureCanvasAgg(figure)
         bottom = (legend + _BELOW) / height
         axes = figure.add_axes((0.165, bottom, 0.795, 1 - bottom - 0.06 / height))
         _scale(axes, x, y)
         if not used:
             axes.text(0.5, 0.5, note, transform=axes.transAxes, ha="center", color=INK["muted"], parse_math=False)
-            return _save(figure, "svg", metadata={"Date": None, "Creator": None}).decode()
+            return saved(figure, "svg", metadata={"Date": None, "Creator": None}).decode()
         drawn = _points(axes, cloud, x, y)
         taken = _boxes(axes, cloud, drawn, x)
         _floors(axes, floors, y, taken)
@@ -149,7 +149,7 @@ def front_figure(cloud: Cloud, x: Axis, y: Axis, *, floors: Sequence[tuple[str, 
             handles=handles, loc="lower left", bbox_to_anchor=(0.02, 0), ncols=_COLUMNS, frameon=False, fontsize=_SMALL,
             handletextpad=0.1, labelspacing=0.25, columnspacing=1.0, borderpad=0.1, handlelength=1.6,
         )  # fmt: skip
-        return _save(figure, "svg", metadata={"Date": None, "Creator": None}).decode()
+        return saved(figure, "svg", metadata={"Date": None, "Creator": None}).decode()
 
 
 def _scale(axes: Any, x: Axis, y: Axis) -> None:
@@ -200,6 +200,9 @@ def _boxes(axes: Any, cloud: Cloud, drawn: Sequence[int], x: Axis) -> list[Any]:
         px, py = axes.transData.transform((cloud.costs[index], cloud.errors[index]))
         reach = radii[index] * point
         found.append(Bbox([(px - reach, py - reach), (px + reach, py + reach)]))
+        if cloud.high[index] > cloud.low[index]:
+            bar = axes.transData.transform([(end[index], cloud.errors[index]) for end in (cloud.low, cloud.high)])
+            found.append(Bbox([bar[0] - 0.3 * point, bar[1] + 0.3 * point]))
     ends = [*(cloud.costs[list(cloud.front)]), x.high]
     for index, end in zip(cloud.front, ends[1:], strict=True):
         px, py = axes.transData.transform((cloud.costs[index], cloud.errors[index]))
@@ -227,7 +230,7 @@ def _points(axes: Any, cloud: Cloud, x: Axis, y: Axis) -> list[int]:
             ends = cloud.low[index], cloud.high[index]
             colour = cloud.markers[cloud.kinds[index]][1] if index in own else _GREY
             axes.plot(ends, [cloud.errors[index]] * 2, color=colour, lw=0.6, zorder=2.2, solid_capstyle="butt")
-    for index in (index for index in drawn if index in own):
+    for index in sorted((index for index in drawn if index in own), key=lambda index: index == cloud.base):
         colour = cloud.markers[cloud.kinds[index]][1]
         look = {"color": colour, "mec": "white", "mew": 0.4, "zorder": 3, "linestyle": "none", "clip_on": False}
         axes.plot(cloud.costs[index], cloud.errors[index], marker=_outline(cloud, index), markersize=5.2, **look)
@@ -267,7 +270,7 @@ def _placed(axes: Any, cloud: Cloud, index: int, text: str, frame: Any, taken: l
         words = [other for other in taken if other.height > _LETTERS]
         free = not any(box.overlaps(other) for other in taken)
         if inside and free and not any(other.overlaps(bit) for bit in line for other in words):
-            taken += [*line, box]
+            taken += [box, *line]
             return True
         said.remove()
     return False

@@ -12,7 +12,7 @@ from ddprt.config import Config
 from ddprt.dataset.store import Dataset
 from ddprt.files import write_text
 from ddprt.methods.statuses import STATUSES
-from ddprt.report import figures
+from ddprt.report import figures, words
 from ddprt.report.evaluate import Evaluation
 from ddprt.report.view import View, default_camera, take_view
 from ddprt.runtime.model import Model
@@ -95,8 +95,8 @@ def write_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    filters: tuple[Callable[..., str], ...] = (_percent, _signed, _seconds, _bytes, _count, _short, _image)
-    environment.filters |= {function.__name__.removeprefix("_"): function for function in filters}
+    environment.filters |= {"percent": words.percent, "seconds": words.seconds, "bytes": words.size, "count": words.count}
+    environment.filters |= {"signed": _signed, "short": _short, "image": _image}
     effects = [Effect(**entry) for entry in data.description.get("plan", [])] if plan_effects is None else list(plan_effects)
     main = next(iter(models))
     page = environment.get_template("page.html.j2").render(
@@ -141,8 +141,8 @@ def warnings(
     ]
     if noise is not None and projection is not None and noise > _NOISE_SHARE * projection:
         text = (
-            f"The held-out maps are uncertain by {_percent(noise)}, more than a third of the projection floor "
-            f"({_percent(projection)}): part of every error is their noise. Raise transport.test_samples."
+            f"The held-out maps are uncertain by {words.percent(noise)}, more than a third of the projection floor "
+            f"({words.percent(projection)}): part of every error is their noise. Raise transport.test_samples."
         )
         found.append(("Noisy references", text))
     if check and (abs(check["mean"]) > _MEAN_Z or check["std"] > _SPREAD_Z or abs(check["relative_bias"]) > _BIAS):
@@ -165,13 +165,12 @@ def warnings(
         found.append((f"{trust['unseen']} held-out lightings that no point sees", STATUSES["blind"]))
     share = scores[main]["negative_share"]
     if share is None or share > _NEGATIVE:
-        much = "all there is" if share is None else f"{_percent(share)} of the positive"
+        much = "all there is" if share is None else f"{words.percent(share)} of the positive"
         found.append(("Negative light", f"Before the clamp, the negative part of the prediction is {much}."))
     for effect in effects:
         if effect.forced or effect.bound is None or (not effect.called and effect.bound > _BOUND):
-            share = (
-                "an unbounded amount of" if effect.bound is None else f"at most {_percent(effect.bound)} of the largest direct"
-            )
+            most = None if effect.bound is None else words.percent(effect.bound)
+            share = f"at most {most} of the largest direct" if most else "an unbounded amount of"
             found.append((f"Effect cut short: {effect.name}", f"{effect.why}; {share} irradiance is left out."))
     return [*found, *(("Scene repaired on loading", note) for note in notes)]
 
@@ -179,10 +178,10 @@ def warnings(
 def method_table(methods: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, list[str]]]:
     """Rows of (name, cells in the order of the columns), best first."""
     order = sorted(methods, key=lambda name: (methods[name]["relative_rmse"] is None, methods[name]["relative_rmse"] or 0))
-    forms: dict[str, Callable[[Any], str]] = {"percent": _percent, "short": _short, "seconds": _seconds}
+    forms: dict[str, Callable[[Any], str]] = {"percent": words.percent, "short": _short, "seconds": words.seconds}
     forms |= {
-        "bytes": _bytes,
-        "count": _count,
+        "bytes": words.size,
+        "count": words.count,
         "plain": str,
         "one": lambda value: f"{value:.1f}",
         "signed": lambda value: _signed(100 * value, 2) + "\u00a0%",
@@ -251,36 +250,8 @@ def _ratio(evaluation: Evaluation, main: str) -> float | None:
     return error / floor if error is not None and floor else None
 
 
-def _percent(value: float | int | None) -> str:
-    if value is None:
-        return "–"
-    size = abs(100 * value)
-    return f"{100 * value:.{0 if size >= 99.5 else 1 if size >= 9.95 else 2}f}\u00a0%"
-
-
 def _signed(value: float | int, digits: int) -> str:
     return f"{value:+.{digits}f}".replace("-", "−")
-
-
-def _seconds(value: float | int) -> str:
-    for unit, scale in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
-        if value >= 0.9995 * scale:
-            return f"{value / scale:.3g} {unit}"
-    return "0 s" if value == 0 else f"{value * 1e9:.0f} ns"
-
-
-def _bytes(value: float | int) -> str:
-    for unit, scale in (("GiB", 2**30), ("MiB", 2**20), ("KiB", 2**10)):
-        if value >= scale:
-            return f"{value / scale:.1f} {unit}"
-    return f"{value:.0f} B"
-
-
-def _count(value: float | int) -> str:
-    for unit, scale in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
-        if value >= scale:
-            return f"{value / scale:.3g} {unit}"
-    return f"{value:.0f}"
 
 
 def _short(value: Any) -> str:

@@ -17,6 +17,7 @@ from ddprt.methods.svd_ridge import LinearTransfer
 
 _MANY = 16  # frames from which BLAS is faster than the loop
 _LARGEST = float(np.finfo(np.float32).max)
+_LANES = 16
 _DIVISIBLE = 2.0**126  # as in `ddprt.fitting.encoding`
 
 
@@ -60,11 +61,12 @@ class Coefficients:
         groups, inputs, bases = self.matrix.shape
         seen = values if groups == 3 else values.reshape(frames, inputs, 1)
         out = np.zeros((frames, groups, bases + self.leads), np.float32)
+        power = np.float32(self.power)
         if frames < _MANY:
-            fine = _answer(seen, self.matrix, self.offset, self.intercept, np.float32(self.power), self.leads, out)
+            fine = _answer(seen, self.matrix, self.offset, self.intercept, power, self.leads, out)
             return out if fine else None
         encoded, size = np.empty((groups, frames, inputs), np.float32), np.empty((groups, frames, 1), np.float32)
-        if not _encode(seen, self.offset, np.float32(self.power), encoded, size):
+        if not _encode(seen, self.offset, power, encoded, size):
             return None
         with np.errstate(over="ignore"):
             answered = size * (encoded @ self.matrix + self.intercept[:, None])
@@ -86,17 +88,16 @@ def _answer(
 ) -> bool:
     """Fills `out`; False where the measured light is not finite. Frames without light stay 0."""
     groups, inputs, bases = matrix.shape
-    z = np.empty(inputs, np.float32)
+    encoded, sizes = np.empty((groups, 1, inputs), np.float32), np.empty((groups, 1, 1), np.float32)
     for frame in range(len(values)):
+        if not _encode(values[frame : frame + 1], offset, power, encoded, sizes):
+            return False
         for group in range(groups):
-            size = _encode_one(values[frame, :, group], offset[group], power, z)
-            if size < 0:
-                return False
+            size, z, M = sizes[group, 0, 0], encoded[group, 0], matrix[group]
             if size == 0:
                 continue
             u = out[frame, group, leads:]
             u[:] = intercept[group]
-            M = matrix[group]
             whole = inputs // 4 * 4
             for p in range(0, whole, 4):  # four at a time: u is read and written a quarter as often
                 a, b, c, d = z[p], z[p + 1], z[p + 2], z[p + 3]
@@ -114,37 +115,39 @@ def _answer(
 
 @compiled
 def _encode(values: np.ndarray, offset: np.ndarray, power: np.floating, z: np.ndarray, size: np.ndarray) -> bool:
-    """The same up to the product: encoded light less its offset, and the factor of each row; False where it is not finite."""
-    for group in range(values.shape[2]):
-        for frame in range(len(values)):
-            found = _encode_one(values[frame, :, group], offset[group], power, z[group, frame])
-            if found < 0:
-                return False
-            size[group, frame, 0] = found
-    return True
+    """Scaled, bent and centred values, (groups, frames, inputs), and what answers are multiplied by before a shader's gamma.
 
-
-@compiled
-def _encode_one(values: np.ndarray, offset: np.ndarray, power: np.floating, z: np.ndarray) -> np.floating:
-    """Scaled, bent and centred values in `z`; returns what the answer is to be multiplied by, before the gamma of the shader.
-
-    0 for a dark frame, -1 where a value is not finite.
+    The factor of a dark frame is 0. False where a value is not finite.
     """
-    total = 0.0
-    for p in range(len(values)):
-        total += np.float64(values[p]) * np.float64(values[p])  # no float32's square leaves the range of float64
-    if not np.isfinite(total):
-        return np.float32(-1)
-    scale = np.float32(min(np.sqrt(total), _DIVISIBLE))
-    if scale == 0:
-        z[:] = 0
-        return np.float32(0)
-    for p in range(len(values)):
-        z[p] = values[p] / scale
-    if power != 1:
-        for p in range(len(values)):
-            bent = abs(z[p]) ** power
-            z[p] = bent if z[p] >= 0 else -bent
-    for p in range(len(values)):
-        z[p] -= offset[p]
-    return scale**power
+    groups, inputs = z.shape[0], z.shape[2]
+    parts = np.empty(_LANES)
+    for frame in range(len(values)):
+        for p in range(inputs):
+            for group in range(groups):
+                z[group, frame, p] = values[frame, p, group]
+        for group in range(groups):
+            row = z[group, frame]
+            parts[:] = 0
+            whole = inputs // _LANES * _LANES
+            for p in range(0, whole, _LANES):  # side by side, which a plain sum may not be turned into
+                for lane in range(_LANES):
+                    parts[lane] += np.float64(row[p + lane]) * np.float64(row[p + lane])
+            total = parts.sum()
+            for p in range(whole, inputs):
+                total += np.float64(row[p]) * np.float64(row[p])  # no float32's square leaves the range of float64
+            if not np.isfinite(total):
+                return False
+            scale = np.float32(min(np.sqrt(total), _DIVISIBLE))
+            size[group, frame, 0] = scale**power
+            if scale == 0:
+                row[:] = 0
+                continue
+            for p in range(inputs):
+                row[p] /= scale
+            if power != 1:
+                for p in range(inputs):
+                    bent = abs(row[p]) ** power
+                    row[p] = bent if row[p] >= 0 else -bent
+            for p in range(inputs):
+                row[p] -= offset[group, p]
+    return True
