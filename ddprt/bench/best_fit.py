@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -83,7 +84,7 @@ def same_fit(model: Model, data: Dataset, config: Config) -> Model:
     return replace(model, relighter=relighter)
 
 
-def projected(model: Model, values: Values, light: Light, weights: str = "area") -> Light:
+def projected(model: Model, values: Values, light: Light, weights: Literal["area", "texel"] = "area") -> Light:
     """Light as the best coefficients on a model's basis give it; see `ddprt.report.evaluate.project`.
 
     Args:
@@ -110,7 +111,7 @@ def _coefficients(
         part = slice(first, first + _AT_ONCE)
         light = data.maps("indirect", indices[part])
         found.append(evaluate.project(model.encoding, vectors, mean, values[part], light, model.area)[0])
-    return np.concatenate(found) if found else np.zeros((0, len(model.relighter.matrix), len(vectors)))  # type: ignore[attr-defined]
+    return np.concatenate(found) if found else np.zeros((0, len(model.relighter.matrix), len(vectors)))  # type: ignore[attr-defined, arg-type]
 
 
 def _maps_of(model: Model) -> tuple[np.ndarray, np.ndarray]:

@@ -4,7 +4,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -169,7 +169,7 @@ def projected(
     measured: Float32[np.ndarray, "lightings points 3"],
     reference: Maps,
     area: Float64[np.ndarray, " texels"],
-    weights: str = "area",
+    weights: Literal["area", "texel"] = "area",
     *,
     clamp: bool = True,
 ) -> Maps:
@@ -187,7 +187,7 @@ def project(
     measured: Float32[np.ndarray, "lightings points 3"],
     reference: Maps,
     area: Float64[np.ndarray, " texels"],
-    weights: str = "area",
+    weights: Literal["area", "texel"] = "area",
 ) -> tuple[Float64[np.ndarray, "lightings groups bases"], Float32[np.ndarray, "lightings 3"]]:
     """The best possible coefficients, by least squares under weights that need not be those that the basis was made for.
 
