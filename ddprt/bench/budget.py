@@ -15,11 +15,11 @@ What ships, fed by an engine's shadow maps, stands at one end; unbiased light at
 | truncation | what the basis can show | all of the paths' light |
 
 From quantisation to operator bias all fields lie in the span of the run's own basis. A residual of a projection is orthogonal
-to that span, so truncation has no product with any of them. A residual of least squares is orthogonal, summed over the lightings
-that it is fitted on, to all that is linear in the measurements: the best transfer is fitted on lightings that
-the run has not seen, the held-out ones among them, so that measurement has none with regularisation and noise but by chance. Were it fitted on other
-lightings than the held-out ones, its own luck d would stand on both sides with opposite sign, as -2 ||d||², however many are
-held out.
+to that span, so truncation has no product with any of them. A residual of least squares is orthogonal, summed over the
+lightings that it is fitted on, to all that is linear in the measurements: the best transfer is fitted on lightings that the
+run has not seen, the held-out ones among them, so that measurement has none with regularisation and noise but by chance. Were
+it fitted on other lightings than the held-out ones, its own luck d would stand on both sides with opposite sign, as -2
+||d||², however many are held out.
 
 What noise does to the basis is the square of what the run's basis leaves out less that of a basis of clean maps.
 It lies within one step, and is told as noise: a difference of two squares by Pythagoras, which no product enters. So vectors at
