@@ -166,7 +166,7 @@ class Run:
         """Takes the error of the main model apart, and writes budget.json; its bakes stay in the folder `budget`."""
         from ddprt.bench.advice import record
         from ddprt.bench.budget import measure_budget
-        from ddprt.bench.yardsticks import Bakery
+        from ddprt.bench.budget_bakes import Bakery
 
         bakery = Bakery(self.scene, self.config, data, self.folder / "budget", self.progress)
         model = next(iter(models.values()))

@@ -12,8 +12,8 @@ import numpy as np
 
 from ddprt.bench.best_fit import best_transfer, projected
 from ddprt.bench.budget import Budget, engine_values
+from ddprt.bench.budget_bakes import Bakery
 from ddprt.bench.chain import squared_error
-from ddprt.bench.yardsticks import Bakery
 from ddprt.config import Config, checked
 from ddprt.dataset.store import Dataset
 from ddprt.methods.svd_ridge import LinearTransfer
@@ -195,11 +195,11 @@ def _against_truncation(budget: Budget, config: Config) -> Knob | None:
 
 def _against_measurement(budget: Budget, config: Config) -> Knob | None:
     """The part fell from half the points to all, and is expected to fall once more by as much."""
-    model, yard = budget.clean, budget.yardsticks
-    points, data = model.points, yard.elsewhere or yard.clean
+    model, yard = budget.model, budget.yardsticks
+    points = model.points
     if not isinstance(model.relighter, LinearTransfer) or points < 2 or config.points.file:
         return None
-    fewer = best_transfer(replace(model, points=points // 2), data, data.split("train"))
+    fewer = best_transfer(replace(model, points=points // 2), *yard.unseen())
     values = yard.clean.values(yard.clean.split("test"), points // 2, model.quantity)
     one, other = (projected(model, budget.values, half) for half in budget.own)
     before = squared_error(fewer.predict(values, clamp=False), (one, other), budget.weight)

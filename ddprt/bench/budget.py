@@ -7,34 +7,41 @@ What ships, fed by an engine's shadow maps, stands at one end; unbiased light at
 | clamp | negative light cut off, as an engine does | negative light kept |
 | runtime mismatch | measured by shadow maps | measured by shadow rays |
 | quantisation | arrays as they are stored | arrays as they were fitted |
-| noise | fitted on the run's maps | the same fit, same lightings, on maps next to free of noise |
-| regularisation | that fit's transfer | the best on lightings in abundance, on the same basis |
-| scenario shift | lightings as trained on | lightings as held out, as many, on the same basis |
-| measurement | the transfer's coefficients | the best coefficients on the same basis |
-| truncation | what the basis can show | the integrator's own held-out maps |
-| operator bias | these maps | unbiased paths |
+| noise | fitted on the run's maps | the same fit on maps next to free of noise, and on their basis |
+| regularisation | that fit's transfer | the best on lightings in abundance |
+| scenario shift | lightings as trained on | lightings as held out, as many |
+| measurement | the transfer's coefficients | the best coefficients |
+| operator bias | what the basis can show of the integrator's own maps | the same of unbiased paths |
+| truncation | what the basis can show | all of the paths' light |
 
-The order makes neighbours near orthogonal. A residual of a projection is orthogonal to all that lies in the span of its basis:
-truncation to measurement, scenario and regularisation, exactly. A residual of least squares is orthogonal to all that is linear
-in the measurements: measurement to scenario and regularisation, up to the chance of which lightings are held out. The abundant
-lightings begin with the trained ones, so that what the two fits owe to chance is nested, too: of two estimates of which one
-uses all data of the other, the difference is uncorrelated with the better one (Hausman 1978). Bias stands at the far end, since
-all before it then happens in the integrator's own world, where maps next to free of noise cost little; only held-out
-lightings need paths.
+From quantisation to operator bias all fields lie in the span of the run's own basis. A residual of a projection is orthogonal
+to that span, so truncation has no product with any of them. A residual of least squares is orthogonal, summed over the
+lightings that it is fitted on, to all that is linear in the measurements: the best transfer is fitted on lightings that the
+run has not seen, the held-out ones among them, so that measurement has none with regularisation and noise but by chance. Were
+it fitted on other lightings than the held-out ones, its own luck d would stand on both sides with opposite sign, as -2
+||d||², however many are held out.
 
-Methods without a basis and a transfer have `the rest` in place of regularisation, measurement and truncation.
+What noise does to the basis is the square of what the run's basis leaves out less that of a basis of clean maps.
+It lies within one step, and is told as noise: a difference of two squares by Pythagoras, which no product enters. So vectors at
+the edge of a basis that change places cost what they cost, and not the light of either.
+
+Bias stands behind all that is learned, which then happens in the integrator's own world, where maps next to free of noise cost
+little; only held-out lightings need paths. What it does to the basis is in truncation, which is of true light.
+
+Methods without a basis and a transfer have `the rest` in place of regularisation, measurement and truncation;
+bias is of whole maps.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from ddprt.axes import Float32, Float64
-from ddprt.bench.best_fit import best_transfer, projected
+from ddprt.bench.best_fit import best_transfer, projected, same_fit
+from ddprt.bench.budget_bakes import Bakery, Yardsticks
 from ddprt.bench.chain import Link, Parts, take_apart
 from ddprt.bench.shadow_maps import engine_irradiance
-from ddprt.bench.yardsticks import Bakery, Yardsticks
 from ddprt.dataset.store import average_into_points
 from ddprt.errors import UserError
 from ddprt.lights import Lighting
@@ -49,13 +56,13 @@ CAUSES = {
     "clamp": "negative light is cut off; its cross terms tell what that wins",
     "runtime mismatch": "an engine's shadow maps measure otherwise than shadow rays",
     "quantisation": "the basis is stored in few bits",
-    "noise": "the maps learned from are noisy, or blurred against noise",
+    "noise": "the maps learned from are noisy, or blurred against noise: what that does to the transfer, and to the basis",
     "regularisation": "few lightings, weighed alike, and a ridge in place of many",
     "scenario shift": "lightings are held out of another distribution than those trained on",
     "measurement": "the points do not tell all that the basis can show",
-    "truncation": "the basis cannot show all there is",
     "the rest": "what the method makes of clean maps: whatever it cannot learn, and what it learned from too few lightings",
-    "operator bias": "the integrator's light differs from unbiased paths",
+    "operator bias": "the integrator's light differs from unbiased paths, as far as the basis can show it",
+    "truncation": "the basis cannot show all there is",
 }
 """Every part, in the order of the chain, and what it means."""
 
@@ -67,6 +74,7 @@ class Budget:
     Attributes:
       parts: squares and products.
       yardsticks: the bakes.
+      model: the one that it is of.
       clean: the model of the same fit on clean maps.
       truth: halves of the unbiased maps, W/m².
       own: halves of the integrator's held-out maps.
@@ -76,6 +84,7 @@ class Budget:
 
     parts: Parts
     yardsticks: Yardsticks
+    model: Model
     clean: Model
     truth: tuple[np.ndarray, np.ndarray]
     own: tuple[np.ndarray, np.ndarray]
@@ -127,16 +136,25 @@ def measure_budget(model: Model, bakery: Bakery) -> Budget:
         engine, stage.facts["rays"] = engine_values(model, [clean.lightings[index] for index in test], config.budget)
     with progress.stage("budget: fits"):
         truth, own = yard.halves(yard.truth), yard.halves(clean)
-        chain, clean_model = _chain(model, bakery, yard, engine, values, own)
-        chain += [Link("operator bias", own), Link("", truth)]
+        chain, clean_model = _chain(model, bakery, yard, engine, values)
+        if isinstance(model.relighter, LinearTransfer):
+            shown = [(projected(model, values, one), projected(model, values, other)) for one, other in (own, truth)]
+            chain += [Link("operator bias", shown[0]), Link("truncation", shown[1]), Link("", truth)]
+        else:
+            chain += [Link("operator bias", own), Link("", truth)]
     with progress.stage("budget: parts"):
         weight = clean.area / clean.area.sum()
         parts = take_apart(chain, weight)
+        if "truncation" in parts.causes:
+            i = parts.causes.index("truncation")
+            kept = projected(clean_model, values, truth[0]), projected(clean_model, values, truth[1])
+            unavoidable = take_apart([Link("truncation", kept), Link("", truth)], weight).products[0, 0]
+            parts = replace(parts, shared={("truncation", "noise"): float(parts.products[i, i] - unavoidable)})
     if not parts.mean > 0 or not parts.products.sum() > 0:
         raise UserError(
             "budget: got held-out lightings without indirect light or without error, expected some; check the lightings"
         )
-    return Budget(parts, yard, clean_model, truth, own, values, weight)
+    return Budget(parts, yard, model, clean_model, truth, own, values, weight)
 
 
 def table(document: dict[str, Any]) -> str:
@@ -166,37 +184,34 @@ def _chain(
     yard: Yardsticks,
     engine: np.ndarray,
     values: np.ndarray,
-    own: tuple[np.ndarray, np.ndarray],
 ) -> tuple[list[Link], Model]:
-    """From what ships to the integrator's own maps, which are left out; and the model fitted on clean maps."""
+    """From what ships to what the integrator's own maps, which are left out, remove; and the model fitted on clean maps."""
     clean, config = yard.clean, bakery.config
     kept = stored(model, config.export.precision)
     unclamped = kept.predict(engine, clamp=False)
     exact = kept.predict(values, clamp=False)
     fitted = exact if kept is model else model.predict(values, clamp=False)
-    clean_model = fit_config(yard.bounded(clean, yard.train), config, model.method)
-    same_fit = clean_model.predict(values, clamp=False)
+    trained = yard.bounded(clean, yard.train)
+    clean_model = fit_config(trained, config, model.method)
     chain = [
         Link.sure("clamp", np.maximum(unclamped, 0)),
         Link.sure("runtime mismatch", unclamped),
         Link.sure("quantisation", exact),
         Link.sure("noise", fitted),
     ]
-    if isinstance(clean_model.relighter, LinearTransfer):
-        many = best_transfer(clean_model, clean, clean.split("train")).predict(values, clamp=False)
-        there, last = many, many
-        if yard.elsewhere is not None:
-            last = best_transfer(clean_model, yard.elsewhere, yard.elsewhere.split("train")).predict(values, clamp=False)
-        shown = projected(clean_model, values, own[0]), projected(clean_model, values, own[1])
+    if isinstance(model.relighter, LinearTransfer):
+        last = best_transfer(model, *yard.unseen())
+        there = last if yard.elsewhere is None else best_transfer(model, (clean, clean.split("train")))
+        there_light = there.predict(values, clamp=False)
         chain += [
-            Link.sure("regularisation", same_fit),
-            Link.sure("scenario shift", there),
-            Link.sure("measurement", last),
-            Link("truncation", shown),
+            Link.sure("regularisation", same_fit(model, trained, config).predict(values, clamp=False)),
+            Link.sure("scenario shift", there_light),
+            Link.sure("measurement", there_light if last is there else last.predict(values, clamp=False)),
         ]
     else:
-        last = same_fit
+        light = clean_model.predict(values, clamp=False)
+        last_light = light
         if yard.elsewhere is not None:
-            last = fit_config(yard.bounded(yard.elsewhere, yard.train), config, model.method).predict(values, clamp=False)
-        chain += [Link.sure("scenario shift", same_fit), Link.sure("the rest", last)]
+            last_light = fit_config(yard.bounded(yard.elsewhere, yard.train), config, model.method).predict(values, clamp=False)
+        chain += [Link.sure("scenario shift", light), Link.sure("the rest", last_light)]
     return chain, clean_model

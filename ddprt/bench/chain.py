@@ -9,7 +9,7 @@ than what is to be told apart.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -45,11 +45,22 @@ class Parts:
       causes: of the steps, from the shipped model to the truth.
       products: mean products of the steps over lightings, channels and (by area) texels, (W/m²)².
       mean: of the truth, W/m².
+      shared: squares of a step that are due to another cause, (W/m²)², by (step, cause); the sum of all parts stays.
     """
 
     causes: tuple[str, ...]
     products: Float64[np.ndarray, "parts parts"]
     mean: float
+    shared: dict[tuple[str, str], float] = field(default_factory=dict)
+
+    @property
+    def squares(self) -> Float64[np.ndarray, " parts"]:
+        """Of the parts, (W/m²)²: those of the steps, but for what is due to other causes."""
+        found = np.diagonal(self.products).copy()
+        for (step, cause), square in self.shared.items():
+            found[self.causes.index(step)] -= square
+            found[self.causes.index(cause)] += square
+        return found
 
     @property
     def squared(self) -> float:
@@ -62,8 +73,8 @@ class Parts:
         return float(np.trace(self.products) / self.products.sum())
 
     def part(self, cause: str) -> float:
-        """The relative square of a part; below 0 only by the chance of independent halves, 0 where the chain lacks it."""
-        return float(self.products[i, i]) / self.mean**2 if (i := self._place(cause)) is not None else 0.0
+        """The relative square of a part; below 0 only by chance, 0 where the chain lacks it."""
+        return float(self.squares[i]) / self.mean**2 if (i := self._place(cause)) is not None else 0.0
 
     def shrunk(self, cause: str, kept: float) -> float:
         """The relative square of the whole if a part's square shrank to a share, and its cross terms by the root of that."""
@@ -72,14 +83,15 @@ class Parts:
             return self.squared
         factors = np.ones(len(self.causes))
         factors[i] = np.sqrt(kept)
-        return float(factors @ self.products @ factors) / self.mean**2
+        crossed = self.products - np.diag(np.diagonal(self.products))
+        return float(factors @ crossed @ factors + factors**2 @ self.squares) / self.mean**2
 
     def record(self) -> dict[str, Any]:
         """Total, parts, cross terms and closure as plain numbers; relative RMSEs and shares of the squared total."""
         whole, square = self.products.sum(), self.mean**2
         parts = [
             {"cause": cause, "relative_rmse": _root(float(value) / square), "share": float(value / whole)}
-            for cause, value in zip(self.causes, np.diagonal(self.products), strict=True)
+            for cause, value in zip(self.causes, self.squares, strict=True)
         ]
         pairs = [(i, j) for i in range(len(self.causes)) for j in range(i + 1, len(self.causes))]
         crossed = [

@@ -3,9 +3,11 @@
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import partial
+from typing import Any, Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 from threadpoolctl import threadpool_limits
@@ -167,38 +169,59 @@ def projected(
     measured: Float32[np.ndarray, "lightings points 3"],
     reference: Maps,
     area: Float64[np.ndarray, " texels"],
+    weights: Literal["area", "texel"] = "area",
+    *,
+    clamp: bool = True,
 ) -> Maps:
-    """Maps by the best possible coefficients: least squares under area weights, whatever weights the basis was made for.
+    """Maps by the best possible coefficients, decoded, and without negative light if `clamp`; see `project`."""
+    coefficients, scale = project(encoding, vectors, mean, measured, reference, area, weights)
+    light = coefficients @ vectors + mean
+    back = np.moveaxis(light, 1, 2) if vectors.shape[1] == len(area) else light.reshape(reference.shape)
+    return np.asarray(_decoded(encoding, back.astype(np.float32), scale, clamp))
+
+
+def project(
+    encoding: Encoding,
+    vectors: Float64[np.ndarray, "bases entries"],
+    mean: Float64[np.ndarray, "*shape"],
+    measured: Float32[np.ndarray, "lightings points 3"],
+    reference: Maps,
+    area: Float64[np.ndarray, " texels"],
+    weights: Literal["area", "texel"] = "area",
+) -> tuple[Float64[np.ndarray, "lightings groups bases"], Float32[np.ndarray, "lightings 3"]]:
+    """The best possible coefficients, by least squares under weights that need not be those that the basis was made for.
 
     Args:
       encoding: of the model.
       vectors: its basis; entries are texels (mono), or channels of texels (multi).
       mean: what it is centred on, or 0.
-      measured: light at its points, W/m², which sets the scale.
+      measured: light at its points, W/m², which sets the scale; what no point sees is projected as it is.
       reference: what is projected, W/m².
       area: of the texels, m².
+      weights: "area", or "texel" to weigh all texels alike.
+    Returns:
+      Coefficients of the encoded light, and the scale that it was encoded by.
     """
     mono = vectors.shape[1] == len(area)
     scale, encoded = _encoded(encoding, measured, reference)
     encoded = np.asarray(encoded, np.float64)
     rows = np.moveaxis(encoded, 2, 1) if mono else encoded.reshape(len(encoded), 1, -1)
-    weights = entry_weights(area, "area", "mono" if mono else "multi").astype(np.float64)
-    gram = (vectors * weights) @ vectors.T
-    coefficients = np.linalg.solve(gram, (((rows - mean) * weights) @ vectors.T).reshape(-1, len(vectors)).T).T
-    light = coefficients.reshape(*rows.shape[:2], -1) @ vectors + mean
-    back = np.moveaxis(light, 1, 2) if mono else light.reshape(encoded.shape)
-    return np.asarray(_decoded(encoding, back.astype(np.float32), scale))
+    entries = entry_weights(area, weights, "mono" if mono else "multi").astype(np.float64)
+    gram = (vectors * entries) @ vectors.T
+    coefficients = np.linalg.solve(gram, (((rows - mean) * entries) @ vectors.T).reshape(-1, len(vectors)).T).T
+    return coefficients.reshape(*rows.shape[:2], -1), np.asarray(scale)
 
 
 @jax.jit
 def _encoded(encoding: Encoding, measured: Array, light: Array) -> tuple[Array, Array]:
     scale = encoding.scale(measured)
+    scale = jnp.where(scale > 0, scale, 1)
     return scale, encoding.encode(light, scale)
 
 
-@jax.jit
-def _decoded(encoding: Encoding, light: Array, scale: Array) -> Array:
-    return encoding.decode(light, scale)
+@partial(jax.jit, static_argnames="clamp")
+def _decoded(encoding: Encoding, light: Array, scale: Array, clamp: bool) -> Array:
+    return encoding.decode(light, scale, clamp=clamp)
 
 
 def bases_curve(data: Dataset, config: Config, truth: Truth) -> list[tuple[int, float, float]]:

@@ -51,6 +51,18 @@ class Yardsticks:
         light, noise = data.maps("indirect", test), data.maps("noise", test)
         return light + noise, light - noise
 
+    def unseen(self) -> list[tuple[Dataset, list[int]]]:
+        """What the best transfer is fitted on: lightings as held out that the run has not trained on, and those held out.
+
+        The held-out ones are among them so that what it leaves of theirs is orthogonal to what it answers: in least squares
+        that holds for the lightings that are fitted, and for others only but for the fit's own luck.
+        """
+        clean, held_out = self.clean, (self.clean, self.clean.split("test"))
+        if self.elsewhere is not None:
+            return [(self.elsewhere, self.elsewhere.split("train")), held_out]
+        fresh = clean.split("train")[self.train :]
+        return [(clean, fresh), held_out] if fresh else [held_out]
+
     def bounded(self, data: Dataset, count: int) -> Dataset:
         """A bake with its first so many training lightings alone."""
         kept = data.split("train")[:count]
@@ -81,9 +93,14 @@ class Bakery:
         """All that the chain needs.
 
         Raises:
-          UserError: the lightings come from a file, so that no more of their kind can be drawn.
+          UserError: the lightings come from a file, so that no more of their kind can be drawn; points chosen by lightings.
         """
         budget, integrator = self.config.budget, self.config.transport.integrator
+        if self.config.points.choose != "blue-noise":
+            raise UserError(
+                f'points.choose: got "{self.config.points.choose}", expected "blue-noise": points that are chosen by the '
+                "training lightings would lie elsewhere in every bake of the budget; choose them so to take an error apart"
+            )
         if self.config.lightings.file:
             raise UserError(
                 f"lightings.file: got {self.config.lightings.file}, expected a distribution that the budget can draw more "
