@@ -1,7 +1,7 @@
 """`ddprt tune`: the setting that meets a budget, found by few trials, and a configuration that makes it again."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -27,7 +27,7 @@ from ddprt.runtime.train import fit_config
 BASES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 _SCORED = (1, 2, 4, 8, 16, 32, 64, 128)
 _PRECISIONS = ("half", "float")
-_FACTORS: dict[str, tuple[float, ...]] = {
+FACTORS: dict[str, tuple[float, ...]] = {
     "atlas.resolution": (0.25, 0.5, 2**-0.5, 1),
     "lightings.train": (0.125, 0.25, 0.5, 1, 2),
     "transport.target_noise": (0.5, 1, 2, 4, 8),
@@ -70,11 +70,19 @@ class Search:
     Args:
       config: the base, with its [tune] section.
       workshop: where settings are tried.
+      factors: what each of `KNOBS` may be, over the base.
+      measure: what is found at a place, for those who know it already; None bakes there.
     Raises:
       UserError: no limit is set, or another method than svd-ridge is to be tuned.
     """
 
-    def __init__(self, config: Config, workshop: Workshop) -> None:
+    def __init__(
+        self,
+        config: Config,
+        workshop: Workshop,
+        factors: Mapping[str, Sequence[float]] = FACTORS,
+        measure: Callable[[Place], Trial] | None = None,
+    ) -> None:
         limits = {name: getattr(config.tune, f"max_{name}") for name in QUANTITIES}
         self.limits = {name: limit for name, limit in limits.items() if limit > 0}
         if not self.limits:
@@ -88,7 +96,8 @@ class Search:
         workshop.check(config)
         self.config, self.workshop = config, workshop
         self.base: Place = tuple(float(_value(config, knob)) for knob in KNOBS)
-        values = [_around(config, knob, base) for knob, base in zip(KNOBS, self.base, strict=True)]
+        values = [_around(config, knob, base, factors[knob]) for knob, base in zip(KNOBS, self.base, strict=True)]
+        self._known = measure or self.measure
         self.bases = tuple(
             count for count in BASES if count > (config.fit.centre == "mean")
         )  # the mean alone is another method
@@ -152,7 +161,20 @@ class Search:
         return True
 
     def _try(self, place: Place) -> None:
-        """Bakes at a place, and scores all numbers of bases."""
+        """Learns what a place is."""
+        trial = self._known(place)
+        self.planner.add(trial)
+        curve = ", ".join(f"{error:.3g} at {bases}" for bases, error in zip(trial.bases, trial.errors, strict=True))
+        self.workshop.progress.say(
+            f"trial {len(self.planner.trials)}: {self._name(place)}: {trial.bake_seconds:.1f} s of bake, error {curve} bases"
+        )
+
+    def measure(self, place: Place) -> Trial:
+        """Bakes at a place, scores all numbers of bases, and notes it in trials.jsonl.
+
+        Raises:
+          UserError: whatever hinders a bake or a fit.
+        """
         setting = self._setting(Plan(place, max(BASES), "float"))
         data, baked = self.workshop.bake(setting)
         model, fitted = self._fit(setting, data)
@@ -160,25 +182,20 @@ class Search:
         sizes = [count for count in _SCORED if count in self.bases and count < most] + [most]
         shorter = [first_bases(model, count) for count in sizes]
         tallies = [self.workshop.yardstick.tally(stored(one, "half")) for one in shorter]
-        errors = [_error(tally) for tally in tallies]
         values = data.values(data.split("train")[:1], model.points, model.quantity)[0]
         trial = Trial(
             place,
             tuple(sizes),
-            tuple(errors),
+            tuple(map(_error, tallies)),
             spread_of(tallies[-1]),
             tuple(_frame_us(one, values) for one in shorter),
             {name: tuple(shipped_bytes(one, name) / 1e6 for one in shorter) for name in _PRECISIONS},
             baked["seconds"],
             fitted,
         )
-        self.planner.add(trial)
-        curve = ", ".join(f"{error:.3g} at {bases}" for bases, error in zip(sizes, errors, strict=True))
-        self.workshop.progress.say(
-            f"trial {len(self.planner.trials)}: {self._name(place)}: {baked['seconds']:.1f} s of bake, error {curve} bases"
-        )
         record = {**about(setting), "trial": asdict(trial), "bake": baked, "environment": environment()}
         append_line(self.workshop.folder / "trials.jsonl", json.dumps(record, allow_nan=False))
+        return trial
 
     def _verify(self, plan: Plan) -> dict[str, float]:
         """The plan itself, fitted and scored; the trial of its place takes over what differs from its curves."""
@@ -312,14 +329,14 @@ def _value(config: Config, knob: str) -> float:
     return float(getattr(getattr(config, section), key))
 
 
-def _around(config: Config, knob: str, base: float) -> tuple[float, ...]:
+def _around(config: Config, knob: str, base: float, factors: Sequence[float]) -> tuple[float, ...]:
     """What a knob may be; alone what it is where it has no effect."""
     still = (knob == "transport.target_noise" and config.transport.samples != "auto") or (
         knob == "points.count" and bool(config.points.file)
     )
     if still or (knob == "lightings.train" and config.lightings.file):
         return (base,)
-    steps = {max(_LEAST[knob], factor * base) for factor in _FACTORS[knob] if factor != 1}
+    steps = {max(_LEAST[knob], factor * base) for factor in factors if factor != 1}
     if knob == "transport.target_noise":
         return tuple(sorted({base, *(min(1.0, float(f"{step:.3g}")) for step in steps)}))
     if knob == "atlas.resolution":
