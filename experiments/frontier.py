@@ -77,7 +77,7 @@ def random_budgets(scene: str, folder: Path, count: int, quick: bool) -> dict[st
     base = config(scene, 40 if quick else 64, 32 if quick else 64)
     factors: dict[str, tuple[float, ...]] = {
         "atlas.resolution": (1,) if quick else (0.5, 1),
-        "lightings.train": (0.5, 1, 2) if quick else (0.25, 0.5, 1, 2),
+        "lightings.train": (0.5, 1) if quick else (0.25, 0.5, 1, 2),
         "transport.target_noise": (1, 4) if quick else (0.5, 1, 2, 4),
         "points.count": (0.5, 1) if quick else (0.5, 1, 2),
     }
@@ -135,7 +135,7 @@ def main(words: Sequence[str]) -> None:
             for scene in chosen:
                 print(f"{scene}: {random_budgets(scene, folder / scene, 10, quick)}", flush=True)
             return
-        sizes = Sizes(texels=100_000, repeats=2, limit=2, product=1024, disk=64 << 20) if quick else Sizes()
+        sizes = Sizes(texels=50_000, repeats=2, limit=1, product=1024, disk=64 << 20) if quick else Sizes()
         record = measure(config("cornell", 48, 32), QUIET, sizes)
         print(table(record))
         summary = record["summary"]

@@ -19,6 +19,9 @@ from ddprt.bench.timing import Timing, compiling, peak_memory
 
 OURS = "ddprt"
 _PIP = {"sklearn": "scikit-learn"}  # packages that pip calls otherwise
+_REST = 0.1  # seconds; OpenBLAS's threads spin for some 30 ms
+_SHORT = 0.05  # seconds
+_WARM = 4  # calls before one that is timed
 _PATIENCE = 60.0  # seconds after which no further turn begins
 
 Verdict = Literal["ours", "equal or better", "less accurate", "yardstick", "skipped"]
@@ -119,6 +122,10 @@ def verdict(errors: Mapping[str, float], ours: Mapping[str, float], blur: Mappin
 def in_turn(works: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, list[float]]:
     """Seconds of several works that take turns, compiled before.
 
+    Threads of BLAS go on spinning for a while when they have nothing to do, which is at the cost of whoever comes next: so each
+    turn begins with a rest. Memory that the one before gave back comes with page faults, some milliseconds for a lightmap: so
+    what is short is called a few times before it is timed, as frame follows frame.
+
     Args:
       works: without side effects; what they return is waited for.
       repeats: turns, at least 1; fewer where they take longer than a minute.
@@ -129,8 +136,15 @@ def in_turn(works: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, l
         if turn and time.perf_counter() - begun > _PATIENCE:
             break
         for name, work in works.items():
-            start = time.perf_counter()
-            jax.block_until_ready(work())
+            time.sleep(_REST)
+            for _ in range(_WARM):
+                start = time.perf_counter()
+                jax.block_until_ready(work())
+                if time.perf_counter() - start > _SHORT:
+                    break
+            else:
+                start = time.perf_counter()
+                jax.block_until_ready(work())
             seconds[name].append(time.perf_counter() - start)
     return seconds
 

@@ -181,7 +181,7 @@ class Search:
         most = model.relighter.report.bases
         sizes = [count for count in _SCORED if count in self.bases and count < most] + [most]
         shorter = [first_bases(model, count) for count in sizes]
-        tallies = [self.workshop.yardstick.tally(stored(one, "half")) for one in shorter]
+        tallies = [self.workshop.yardstick.tally(stored(without_last(model, most - count), "half")) for count in sizes]
         values = data.values(data.split("train")[:1], model.points, model.quantity)[0]
         trial = Trial(
             place,
@@ -275,6 +275,13 @@ def first_bases(model: Model, count: int) -> Model:
     kept = count - (report.bases - len(linear.basis))
     shorter = replace(linear, matrix=linear.matrix[:, :kept], intercept=linear.intercept[:, :kept], basis=linear.basis[:kept])
     return replace(model, relighter=replace(shorter, report=replace(report, bases=count)))
+
+
+def without_last(model: Model, count: int) -> Model:
+    """The same with its last bases black: shapes stay, so that nothing compiles again."""
+    linear = model.relighter
+    assert isinstance(linear, LinearTransfer), "the planner fits svd-ridge"
+    return replace(model, relighter=linear.truncated(len(linear.basis) - count))
 
 
 def spread_of(tally: Tally) -> float:
