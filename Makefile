@@ -1,6 +1,7 @@
 # ddprt: the two commands of the README are `make cornell` and `make test`.
 PYTHON ?= python3.11
 BIN := .venv/bin
+WORKERS ?= 2
 READY := .venv/.ready
 
 .PHONY: cornell test test-slow check format lock clean
@@ -9,7 +10,7 @@ cornell: $(READY)
 	$(BIN)/ddprt run configs/cornell.toml --out runs/cornell
 
 test: $(READY)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -m slow

@@ -44,17 +44,31 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         print(f"ddprt: {error}", file=sys.stderr)
         code = 2
     except KeyboardInterrupt:
-        print("ddprt: interrupted; finished files are kept, the same command goes on from there", file=sys.stderr)
-        code = 130
+        code = _interrupted()
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
     except Exception as error:
         if debug:
             raise
+        if _by_interrupt(error):
+            sys.exit(_interrupted())
         print(f"ddprt: {type(error).__name__}: {error} ({REPORT_ISSUE})", file=sys.stderr)
         code = 1
     sys.exit(code)
+
+
+def _interrupted() -> int:
+    print("ddprt: interrupted; finished files are kept, the same command goes on from there", file=sys.stderr)
+    return 130
+
+
+def _by_interrupt(error: BaseException) -> bool:
+    """Whether an error arose while an interrupt was on its way out: it may hit a lock between being asked for and held."""
+    found: BaseException | None = error
+    while found is not None and not isinstance(found, KeyboardInterrupt):
+        found = found.__cause__ or found.__context__
+    return found is not None
 
 
 @contextmanager

@@ -299,10 +299,19 @@ def test_no_product_of_the_basis_may_round_to_tf32() -> None:
             assert loose(module._decompose, columns, weights, given)[0] == 6  # three in the loop, three for the last tile
             assert loose(module._decompose, columns, weights, given)[1] == []
             sharpen = lambda *args: module._sharpen(*args, 2, 6)  # noqa: E731
-            for function in (module._build, sharpen):
-                count, faults = loose(function, columns, weights, given, values, rotation)
-                assert count >= 6
-                assert faults == []
+            count, faults = loose(sharpen, columns, weights, given, values, rotation)
+            assert count >= 6
+            assert faults == []
+            count, faults = loose(module._projected, rotation, values, rotation, columns, weights, given)
+            assert count == 4, "two in the loop, two for the last tile"
+            assert faults == []
+        for function, arguments in (
+            (module._straightened, (rotation, columns)),
+            (module._weighed, (rotation, values, rotation, values)),
+        ):
+            count, faults = loose(function, *arguments)
+            assert count == 1
+            assert faults == []
     assert len(loose(lambda x: x @ x.T, columns)[1]) == 1, "the check itself bites"
 
 

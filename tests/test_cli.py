@@ -6,7 +6,9 @@ import subprocess
 import sys
 import time
 import tomllib
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -445,3 +447,21 @@ def test_the_smallest_atlas_works_where_its_charts_fit(job: Path, tmp_path: Path
 def test_configuration_of_a_run_is_plain_toml(done: Path) -> None:
     document = tomllib.loads((done / "config.toml").read_text())
     assert document["fit"]["bases"] == 3
+
+
+def test_an_error_that_an_interrupt_makes_is_an_interrupt(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    def interrupted(call: Any) -> None:
+        try:
+            raise KeyboardInterrupt
+        finally:
+            raise RuntimeError("cannot release un-acquired lock")
+
+    def broken(call: Any) -> None:
+        raise RuntimeError("cannot release un-acquired lock")
+
+    for work, code, words in ((interrupted, 130, "goes on from there"), (broken, 1, "this is our fault")):
+        monkeypatch.setitem(VERBS, "doctor", replace(VERBS["doctor"], work=work))
+        with pytest.raises(SystemExit) as end:
+            main(["doctor"])
+        assert end.value.code == code
+        assert words in capsys.readouterr().err

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -221,8 +222,24 @@ def test_ratios_are_of_medians_and_seconds_of_one_frame(monkeypatch: pytest.Monk
 def test_turns_alternate() -> None:
     order: list[str] = []
     seconds = in_turn({name: lambda name=name: order.append(name) for name in "abc"}, 3)
-    assert order == [*"abcabcabc"]
+    assert [name for name, _ in groupby(order)] == [*"abcabcabc"]
     assert {name: len(found) for name, found in seconds.items()} == {"a": 3, "b": 3, "c": 3}
+
+
+def test_what_is_short_is_warm_before_it_is_timed_and_what_is_long_runs_once() -> None:
+    calls: list[float] = []
+
+    def work(pause: float) -> None:
+        calls.append(pause)
+        time.sleep(pause if len(calls) % 5 else 0)  # every fifth call of the short one is the quick one
+
+    short = in_turn({"short": lambda: work(0.02)}, 2)["short"]
+    assert len(calls) == 10
+    assert max(short) < 0.02, "the calls before it do not count"
+    calls.clear()
+    (slow,) = in_turn({"long": lambda: work(0.1)}, 1)["long"]
+    assert len(calls) == 1
+    assert slow >= 0.1
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from ddprt.bench import tune as tuning
 from ddprt.bench.planner import KNOBS, QUANTITIES, Plan, Trial
 from ddprt.bench.settings import Setting, changed
 from ddprt.bench.trial import Workshop
-from ddprt.bench.tune import Outcome, Search, _around, first_bases, spread_of, told, tune, with_measured
+from ddprt.bench.tune import FACTORS, Outcome, Search, _around, first_bases, spread_of, told, tune, with_measured
 from ddprt.cli import main
 from ddprt.config import Config, checked, load_config
 from ddprt.dataset.store import Dataset
@@ -281,7 +281,7 @@ def test_a_knob_can_stay_where_it_is(knob: str, value: float) -> None:
     if noise != (value <= 1) or (knob == "atlas.resolution" and value < 8):
         return
     config = changed(Config(), {knob: value})
-    values = _around(config, knob, float(value))
+    values = _around(config, knob, float(value), FACTORS[knob])
     assert value in values
     assert list(values) == sorted(set(values))
     for each in values:
@@ -301,7 +301,7 @@ def test_a_knob_can_stay_where_it_is(knob: str, value: float) -> None:
 def test_knobs_without_effect_are_not_turned(changes: dict[str, Any], still: str) -> None:
     config = changed(Config(), changes)
     for knob in KNOBS:
-        assert (len(_around(config, knob, tuning._value(config, knob))) == 1) == (knob == still)
+        assert (len(_around(config, knob, tuning._value(config, knob), FACTORS[knob])) == 1) == (knob == still)
 
 
 @pytest.mark.parametrize("centre", ["none", "mean"])

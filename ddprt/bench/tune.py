@@ -28,10 +28,10 @@ BASES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 _SCORED = (1, 2, 4, 8, 16, 32, 64, 128)
 _PRECISIONS = ("half", "float")
 FACTORS: dict[str, tuple[float, ...]] = {
-    "atlas.resolution": (0.25, 0.5, 2**-0.5, 1),
-    "lightings.train": (0.125, 0.25, 0.5, 1, 2),
-    "transport.target_noise": (0.5, 1, 2, 4, 8),
-    "points.count": (0.5, 1, 2, 4),
+    "atlas.resolution": (0.25, 0.5, 2**-0.5, 1.0),
+    "lightings.train": (0.125, 0.25, 0.5, 1.0, 2.0),
+    "transport.target_noise": (0.5, 1.0, 2.0, 4.0, 8.0),
+    "points.count": (0.5, 1.0, 2.0, 4.0),
 }
 _LEAST = {"atlas.resolution": 16, "lightings.train": 4, "transport.target_noise": 1e-3, "points.count": 4}
 _SURE = 0.9
