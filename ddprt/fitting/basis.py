@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 _TILE = 1 << 10  # entries turned to float64 at once: 256 columns of them fit a core's second cache
-_BLOCK = 1 << 25  # bytes of columns that are cut out, or come from disk, at once
+_BLOCK = 1 << 25  # bytes of columns that come from disk at once
 RANK_CUT = 1e-7
 """Singular values below this share of the largest are rounding of the float32 data, not light."""
 
@@ -74,9 +74,9 @@ def fit_basis(
 ) -> Basis:
     """The best `bases`-dimensional space for the columns, in the weighted least-squares sense.
 
-    The data is walked through in blocks, two times, three with `centre` and once more where the spectrum is deep. Beside a few
-    blocks and the matrices of columns by columns, only the vectors are held, once in float64. How the entries are cut into
-    blocks changes nothing: the tiles that sums run over are the same.
+    The data is walked through in blocks (an array is one), two times, three with `centre` and once more where the spectrum is
+    deep. Beside a few blocks and the matrices of columns by columns, only the vectors are held, once in float64. How the
+    entries are cut into blocks changes nothing: the tiles that sums run over are the same.
 
     Args:
       columns: one observation per row: scaled, encoded indirect light of a lighting (and channel).
