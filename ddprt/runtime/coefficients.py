@@ -2,10 +2,11 @@
 
 A shader composes y = max(0, sum over textures of u_b B_b)^gamma. Here the scale of the measured light is folded into u, and a
 mean counts as the first texture, so that these numbers and the textures are all that it needs. A frame is answered by one
-compiled loop; many frames by a product of matrices.
+compiled loop; many frames by a product of matrices, of the plain light where the model is linear without a mean.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -38,6 +39,20 @@ class Coefficients:
     power: float
     leads: int
 
+    @cached_property
+    def _at_once(self) -> Float32[np.ndarray, "values answers"] | None:
+        """M of all groups as one matrix for measured light as it lies in memory; None where answers are not M x.
+
+        Two thirds of it are zeros for three channels, which costs less than to pull the channels apart.
+        """
+        if self.power != 1 or self.leads or self.offset.any() or self.intercept.any():
+            return None
+        groups, inputs, bases = self.matrix.shape
+        wide = np.zeros((inputs, groups, groups, bases), np.float32)
+        for group in range(groups):
+            wide[:, group, group] = self.matrix[group]
+        return wide.reshape(inputs * groups, groups * bases)
+
     @classmethod
     def of(cls, relighter: object, encoding: Encoding) -> "Coefficients":
         """Those of a model.
@@ -65,6 +80,12 @@ class Coefficients:
         if frames < _MANY:
             fine = _answer(seen, self.matrix, self.offset, self.intercept, power, self.leads, out)
             return out if fine else None
+        if self._at_once is not None:
+            with np.errstate(over="ignore", invalid="ignore"):
+                answered = values.reshape(frames, -1) @ self._at_once
+            # Zeros times infinity are NaN: light that is not finite shows. So does a sum past the range, which scaling keeps.
+            if np.isfinite(answered).all():
+                return answered.reshape(frames, groups, bases)
         encoded, size = np.empty((groups, frames, inputs), np.float32), np.empty((groups, frames, 1), np.float32)
         if not _encode(seen, self.offset, power, encoded, size):
             return None
