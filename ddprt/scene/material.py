@@ -84,9 +84,7 @@ class Material:
         return {name: image for name, image in found.items() if image is not None}
 
 
-def bilinear(
-    image: Float[np.ndarray, "height width ..."], uv: Float[np.ndarray, "n 2"]
-) -> Float[np.ndarray, "n ..."]:
+def bilinear(image: Float[np.ndarray, "height width ..."], uv: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n ..."]:
     """Repeating bilinear lookup, texel centres at half-integers."""
     height, width = image.shape[:2]
     position = uv * [width, height] - 0.5
