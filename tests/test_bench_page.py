@@ -17,9 +17,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ddprt.bench import pareto
-from ddprt.bench.page import BASE, SEVERAL, Sweep, embedded, spoken, ticks, write_all, write_page
-from ddprt.bench.pareto import COSTS, DRAWN, ERRORS
+from ddprt.bench.frontier import pareto
+from ddprt.bench.frontier.page import BASE, SEVERAL, Sweep, embedded, spoken, ticks, write_all, write_page
+from ddprt.bench.frontier.pareto import COSTS, DRAWN, ERRORS
 from ddprt.report import fronts
 
 KNOBS: dict[str, tuple[Any, ...]] = {

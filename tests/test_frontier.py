@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 
-from ddprt.bench import trial
-from ddprt.bench.frontier import RESULTS, read_results, sweep
-from ddprt.bench.settings import settings_of
-from ddprt.bench.trial import Workshop
+from ddprt.bench.frontier.sweep import RESULTS, read_results, sweep
+from ddprt.bench.measure import trial
+from ddprt.bench.measure.settings import settings_of
+from ddprt.bench.measure.trial import Workshop
 from ddprt.cli import main
 from ddprt.config import Config, checked
 from ddprt.errors import UserError

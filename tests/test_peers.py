@@ -15,12 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ddprt.bench import fit_peers, peers, relight_peers, ridge_peers, roofline, standing
-from ddprt.bench.fit_peers import EPS, Maps, centred, fit_rows, make_columns
-from ddprt.bench.relight_peers import learned, make_frames, make_model, make_scenes, relight_rows, transfer_rows
-from ddprt.bench.ridge_peers import Pairs, make_pairs, ridge_rows
-from ddprt.bench.standing import OURS, Peer, Row, best, compare, in_turn, verdict
-from ddprt.bench.timing import Timing
+from ddprt.bench.measure.timing import Timing
+from ddprt.bench.peers import fit, peers, relight, ridge, roofline, standing
+from ddprt.bench.peers.fit import EPS, Maps, centred, fit_rows, make_columns
+from ddprt.bench.peers.relight import learned, make_frames, make_model, make_scenes, relight_rows, transfer_rows
+from ddprt.bench.peers.ridge import Pairs, make_pairs, ridge_rows
+from ddprt.bench.peers.standing import OURS, Peer, Row, best, compare, in_turn, verdict
 
 TORCHLESS = {"needs": "no_such_library"}
 
@@ -295,7 +295,7 @@ def maps() -> Maps:
 
 
 def test_truth_is_that_of_the_whole_decomposition(maps: Maps, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fit_peers, "_TILE", 700)
+    monkeypatch.setattr(fit, "_TILE", 700)
     sigma, right = Maps(maps.columns, maps.bases).exact
     _, whole, vectors = np.linalg.svd(maps.columns.astype(float), full_matrices=False)
     # Both are stable: off by a few eps sigma_1, and vectors by that over the gap, which is 0.6 of the 6th value.
@@ -355,7 +355,7 @@ def test_every_way_to_a_basis_is_the_same_way(maps: Maps) -> None:
 
 
 def test_the_yardstick_is_the_whole_product(maps: Maps) -> None:
-    gram = next(peer for peer in fit_peers.PEERS if peer.name == peers.GRAM)
+    gram = next(peer for peer in fit.PEERS if peer.name == peers.GRAM)
     A = maps.columns.astype(float)
     np.testing.assert_allclose(gram.prepare(maps)(), A @ A.T, rtol=1e-12, atol=1e-12 * np.linalg.norm(A) ** 2)
 
@@ -395,7 +395,7 @@ def test_every_frame_is_the_same_light() -> None:
     scenes = make_scenes(50, 4, 9, 3, 0)
     assert scenes.moved == 4 * 50 * (4 + 3)
     lights = [oracle(model, scenes.values) for model in scenes.models]
-    works = [peer.prepare(scenes) for peer in relight_peers.RELIGHT if not peer.missing]
+    works = [peer.prepare(scenes) for peer in relight.RELIGHT if not peer.missing]
     assert len(works) >= 5
     for work in [*works, *works]:
         before = scenes.turn
@@ -413,14 +413,14 @@ def test_every_frame_is_the_same_light() -> None:
 def test_every_transfer_is_the_same(one: bool) -> None:
     model = make_model(20, 4, 9, 0)
     frames = make_frames(model, 33, 0, one=one)
-    assert len(frames.values) == (relight_peers._LOOP if one else 33)
+    assert len(frames.values) == (relight._LOOP if one else 33)
     assert frames.flops == 2 * 3 * 4 * 9 * len(frames.values)
     matrix = np.asarray(learned(model).matrix, float)
     wanted = np.array(
         [[[sum(matrix[c, k] * frame[:, c]) for k in range(4)] for c in range(3)] for frame in frames.values.astype(float)]
     )
     np.testing.assert_allclose(frames.exact, wanted, rtol=1e-12)
-    for peer in relight_peers.TRANSFER:
+    for peer in relight.TRANSFER:
         if not peer.missing:
             found = np.asarray(peer.prepare(frames)()).reshape(wanted[-1].shape if one else wanted.shape)
             np.testing.assert_allclose(found, wanted[-1] if one else wanted, rtol=20 * EPS)
@@ -440,7 +440,7 @@ class Absent:
             raise ModuleNotFoundError(f"No module named {name!r}")
 
 sys.meta_path.insert(0, Absent())
-from ddprt.bench.peers import Sizes, measure, table
+from ddprt.bench.peers.peers import Sizes, measure, table
 from ddprt.config import load_config
 from ddprt.progress import Progress
 
@@ -520,7 +520,7 @@ def test_the_table_shows_every_row(whole: dict[str, Any]) -> None:
 
 
 def test_ridge_peers_have_one_of_us() -> None:
-    for crew in (fit_peers.PEERS, ridge_peers.PEERS, relight_peers.RELIGHT, relight_peers.TRANSFER):
+    for crew in (fit.PEERS, ridge.PEERS, relight.RELIGHT, relight.TRANSFER):
         names = [peer.name for peer in crew]
         assert names.count(OURS) == 1
         assert len(set(names)) == len(names)

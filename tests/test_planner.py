@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ddprt.bench.planner import KNOBS, Law, Place, Plan, Planner, Trial
+from ddprt.bench.tune.planner import KNOBS, Law, Place, Plan, Planner, Trial
 
 BASE: Place = (256.0, 128.0, 0.01, 128.0)
 VALUES = ((64.0, 128.0, 181.0, 256.0), (16.0, 32.0, 64.0, 128.0, 256.0), (0.005, 0.01, 0.02, 0.04), (64.0, 128.0, 256.0))

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from ddprt.bench.settings import Setting, changed, plan_of, settings_of
+from ddprt.bench.measure.settings import Setting, changed, plan_of, settings_of
 from ddprt.config import Config, checked, load_config
 from ddprt.errors import UserError
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 import ddprt
-from ddprt.bench import trial as trials
-from ddprt.bench import tune as tuning
-from ddprt.bench.planner import KNOBS, QUANTITIES, Plan, Trial
-from ddprt.bench.settings import Setting, changed
-from ddprt.bench.trial import Workshop
-from ddprt.bench.tune import FACTORS, Outcome, Search, _around, first_bases, spread_of, told, tune, with_measured
+from ddprt.bench.measure import trial as trials
+from ddprt.bench.measure.settings import Setting, changed
+from ddprt.bench.measure.trial import Workshop
+from ddprt.bench.tune import search as tuning
+from ddprt.bench.tune.planner import KNOBS, QUANTITIES, Plan, Trial
+from ddprt.bench.tune.search import FACTORS, Outcome, Search, _around, first_bases, spread_of, told, tune, with_measured
 from ddprt.cli import main
 from ddprt.config import Config, checked, load_config
 from ddprt.dataset.store import Dataset

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-import ddprt.bench.yardstick as module
-from ddprt.bench.yardstick import Yardstick, carrier, make_yardstick
+import ddprt.bench.measure.yardstick as module
+from ddprt.bench.measure.yardstick import Yardstick, carrier, make_yardstick
 from ddprt.config import Config, load_config
 from ddprt.dataset.generate import bake
 from ddprt.dataset.store import Dataset

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from ddprt import __version__
-from ddprt.bench.settings import Setting, digest_of
-from ddprt.bench.timing import peak_memory, timed
-from ddprt.bench.yardstick import Yardstick, make_yardstick
+from ddprt.bench.measure.settings import Setting, digest_of
+from ddprt.bench.measure.timing import peak_memory, timed
+from ddprt.bench.measure.yardstick import Yardstick, make_yardstick
 from ddprt.config import Config
 from ddprt.dataset.generate import bake
 from ddprt.dataset.splits import SPLITS, choose_lightings
