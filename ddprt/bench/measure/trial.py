@@ -83,10 +83,8 @@ class Workshop:
         Raises:
           UserError: it is black, or whatever hinders a bake.
         """
-        drawn = self.config.lightings.model_copy(update={"choose": "random", "target_error": 0.0})  # held-out ones always are
-        config = self.config.model_copy(update={"lightings": drawn})
         place = self.folder / f"truth-{self.truth}"
-        found = make_yardstick(self.scene, config, place, self.progress, resolution=self.resolution)
+        found = make_yardstick(self.scene, self.config, place, self.progress, resolution=self.resolution)
         if found.noise is None:
             raise UserError(
                 "lightings: got held-out lightings without indirect light, expected some to score on; "
