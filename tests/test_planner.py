@@ -131,5 +131,17 @@ def test_a_tried_place_is_told_as_it_was_measured() -> None:
             assert np.exp(planner.guesses(plan)[name].mean) == pytest.approx(value, rel=1e-9), name
 
 
+def test_where_all_else_is_barred_the_place_that_was_tried_is_the_answer() -> None:
+    """Also on a budget that it is far from: there is nothing else to propose."""
+    planner = Planner(BASE, VALUES, BASES, ("half", "float"), {"relative_rmse": 0.02})
+    planner.add(world(BASE))
+    assert planner.next()[0].place != BASE
+    planner.barred = {*product(*VALUES)} - {BASE}
+    plan, chance = planner.next()
+    assert plan == Plan(BASE, 128, "half"), "as near as it comes"
+    assert chance < 1e-6, "its error is half as much again, which is known to a twentieth"
+    assert Planner(BASE, [(value,) for value in BASE], BASES, ("half",), planner.limits, planner.trials).next()[0] == plan
+
+
 def test_knobs_and_places_are_of_one_length() -> None:
     assert len(KNOBS) == len(BASE) == len(VALUES)
