@@ -19,7 +19,7 @@ import scipy.linalg
 from jaxtyping import Float
 
 from ddprt import seeds
-from ddprt.bench.standing import OURS, Peer, Row, compare
+from ddprt.bench.peers.standing import OURS, Peer, Row, compare
 from ddprt.config import Config, checked
 from ddprt.dataset.generate import bake
 from ddprt.fitting.basis import fit_basis

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from ddprt import __version__
-from ddprt.bench.settings import Setting, digest_of
-from ddprt.bench.timing import peak_memory, timed
-from ddprt.bench.yardstick import Yardstick, make_yardstick
+from ddprt.bench.measure.settings import Setting, digest_of
+from ddprt.bench.measure.timing import peak_memory, timed
+from ddprt.bench.measure.yardstick import Yardstick, make_yardstick
 from ddprt.config import Config
 from ddprt.dataset.generate import bake
 from ddprt.dataset.splits import SPLITS, choose_lightings
@@ -83,10 +83,8 @@ class Workshop:
         Raises:
           UserError: it is black, or whatever hinders a bake.
         """
-        drawn = self.config.lightings.model_copy(update={"choose": "random", "target_error": 0.0})  # held-out ones always are
-        config = self.config.model_copy(update={"lightings": drawn})
         place = self.folder / f"truth-{self.truth}"
-        found = make_yardstick(self.scene, config, place, self.progress, resolution=self.resolution)
+        found = make_yardstick(self.scene, self.config, place, self.progress, resolution=self.resolution)
         if found.noise is None:
             raise UserError(
                 "lightings: got held-out lightings without indirect light, expected some to score on; "
