@@ -30,8 +30,8 @@ from ddprt.progress import Progress
 from ddprt.runtime.model import Model
 from ddprt.runtime.precision import shipped_bytes, stored
 from ddprt.runtime.train import fit_config
-from ddprt.scene.files import load_scene
 from ddprt.scene.mesh import Scene
+from ddprt.transport.effects import configured_scene
 from ddprt.transport.embree import Tracer
 
 SCHEMA = 1
@@ -61,7 +61,7 @@ class Workshop:
     @cached_property
     def scene(self) -> Scene:
         """The scene of the configuration."""
-        return load_scene(self.config.scene.name, **self.config.scene.parameters)
+        return configured_scene(self.config)
 
     @cached_property
     def truth(self) -> str:
@@ -133,7 +133,7 @@ class Workshop:
                 return open_dataset(folder), before["bake"]
         shutil.rmtree(folder, ignore_errors=True)
         config, lightings = self._training_only(setting.config)
-        scene = load_scene(config.scene.name, **config.scene.parameters)
+        scene = configured_scene(config)
         progress = Progress(self.progress.quiet)
         progress.say(f"bake: {setting.name}")
         with peak_memory() as peak:
