@@ -60,11 +60,15 @@ class Config(Section):
         if not isinstance(table, dict):
             return table
         knobs = dict(_flat(table))
+        asks = ("bench", "sweep", "budget", "tune", "report")
+        known = [key for key in keys() if key.split(".")[0] not in asks]
         for key, values in knobs.items():
-            if key not in keys() or key.split(".")[0] in ("bench", "sweep", "budget", "tune", "report"):
-                raise ValueError(f"{key}: got {_toml(key)}, expected a setting of a run{nearest(key, keys())}")
+            if key not in known:
+                hint = nearest(key, known) or "; `ddprt bench --help` lists them all"
+                raise ValueError(f"sweep.{key}: got {_toml(key)}, expected a setting of a run{hint}")
             if not isinstance(values, list | tuple) or not values:
-                raise ValueError(f"{key}: got {values!r}, expected a list of at least one value; write [{_toml(values)}]")
+                remedy = "name one, or leave the knob out" if values == [] else f"write [{_toml(values)}]"
+                raise ValueError(f"sweep.{key}: got {values!r}, expected a list of at least one value; {remedy}")
         return knobs
 
     def to_toml(self) -> str:
@@ -143,9 +147,11 @@ def explain(error: ValidationError, path: str | Path | None, overrides: dict[str
     """First fault of a pydantic error as one line: file, key, got, expected, what to do."""
     faults = error.errors()
     fault = faults[0]
-    key, text = spoken(fault)
-    place = [str(part) for part in (*fault["loc"], key) if part != ""]
+    told, text = spoken(fault)
+    place = [str(part) for part in (*fault["loc"], told) if part != ""]
     dotted = next((key for n in range(len(place), 0, -1) if (key := ".".join(place[:n])) in keys()), ".".join(place))
+    if told.startswith("sweep."):
+        dotted = told  # a knob of the table, which is no key by itself
     source = f"--{dotted}" if dotted in overrides else f"{path or 'configuration'}: {dotted}"
     if fault["type"] == "extra_forbidden":
         siblings = [key for key in keys() if key.split(".")[:-1] == place[:-1]] or keys()
