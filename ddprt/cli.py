@@ -96,7 +96,7 @@ def _doubts_in_one_line() -> Iterator[None]:
 def _no_interrupt_lost() -> Iterator[None]:
     """Python drops an interrupt that hits a destructor or a callback of its garbage collector: it is asked for again.
 
-    JAX has such a callback, and where arrays come and go every other interrupt hits it.
+    JAX has such a callback, which runs often enough to be hit: two of four interrupts of a small sweep were lost in it.
     """
     as_before = sys.unraisablehook
 
