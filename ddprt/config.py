@@ -18,6 +18,7 @@ from ddprt.sections import (
     AtlasConfig,
     BenchConfig,
     BudgetConfig,
+    EffectsConfig,
     ExportConfig,
     FitConfig,
     LightingsConfig,
@@ -40,6 +41,7 @@ class Config(Section):
     lightings: LightingsConfig = LightingsConfig()
     points: PointsConfig = PointsConfig()
     transport: TransportConfig = TransportConfig()
+    effects: EffectsConfig = EffectsConfig()
     fit: FitConfig = FitConfig()
     methods: MethodsConfig = MethodsConfig()
     report: ReportConfig = ReportConfig()

@@ -18,9 +18,8 @@ from ddprt.errors import UserError
 from ddprt.files import make_folder, write_text
 from ddprt.machine import machine, peak_memory_gib
 from ddprt.progress import Progress
-from ddprt.scene.files import load_scene
 from ddprt.scene.mesh import Scene
-from ddprt.transport.effects import Plan, plan
+from ddprt.transport.effects import Plan, configured_scene, plan
 
 _AFTER_BAKE = ("fit", "evaluate", "bases curve", "spot check", "report", "export")
 
@@ -47,7 +46,7 @@ class Run:
     def scene(self) -> Scene:
         """The scene, loaded once; its repairs are told."""
         if self._scene is None:
-            self._scene = load_scene(self.config.scene.name, **self.config.scene.parameters)
+            self._scene = configured_scene(self.config)
             for note in self._scene.notes:
                 self.progress.say(f"scene: {note}")
         return self._scene
