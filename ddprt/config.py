@@ -61,9 +61,12 @@ class Config(Section):
         if not isinstance(table, dict):
             return table
         knobs = dict(_flat(table))
+        asks = ("bench", "sweep", "budget", "tune", "report")
+        known = [key for key in keys() if key.split(".")[0] not in asks]
         for key, values in knobs.items():
-            if key not in keys() or key.split(".")[0] in ("bench", "sweep", "budget", "tune", "report"):
-                raise ValueError(f"{key}: got {_toml(key)}, expected a setting of a run{nearest(key, keys())}")
+            if key not in known:
+                hint = nearest(key, known) or "; `ddprt bench --help` lists them all"
+                raise ValueError(f"{key}: got {_toml(key)}, expected a setting of a run{hint}")
             if not isinstance(values, list | tuple) or not values:
                 raise ValueError(f"{key}: got {values!r}, expected a list of at least one value; write {_listed(key, values)}")
         return knobs
