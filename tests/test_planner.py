@@ -181,5 +181,12 @@ def test_of_limits_far_out_of_reach_the_farthest_binds(frame: float, bake: float
     assert planner.binding() == ("bake_seconds" if bake < frame else "frame_us")
 
 
+def test_trials_are_learned_from_not_handed_over() -> None:
+    """A planner that was made of some would know no laws."""
+    for given in ({"trials": [world(BASE)]}, {"barred": {BASE}}, {"_laws": {}}):
+        with pytest.raises(TypeError, match="unexpected keyword"):
+            Planner(BASE, VALUES, BASES, ("half",), {"frame_us": 1.0}, **given)
+
+
 def test_knobs_and_places_are_of_one_length() -> None:
     assert len(KNOBS) == len(BASE) == len(VALUES)

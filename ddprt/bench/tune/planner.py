@@ -130,6 +130,7 @@ class Planner:
       bases: numbers of bases that may be asked for, rising.
       precisions: that may be stored.
       limits: the budget; quantities that are missing are free.
+    Attributes:
       trials: what was learned from, at places made of `values`.
       barred: places that cannot be baked, so none that was tried.
     """
@@ -139,9 +140,9 @@ class Planner:
     bases: Sequence[int]
     precisions: Sequence[str]
     limits: Mapping[str, float]
-    trials: list[Trial] = field(default_factory=list)
-    barred: set[Place] = field(default_factory=set)
-    _laws: dict[str, Law] = field(default_factory=dict)
+    trials: list[Trial] = field(default_factory=list, init=False)
+    barred: set[Place] = field(default_factory=set, init=False)
+    _laws: dict[str, Law] = field(default_factory=dict, init=False)
 
     def add(self, trial: Trial) -> None:
         """Learns from a trial."""
