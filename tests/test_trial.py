@@ -207,6 +207,30 @@ def test_a_bake_of_another_version_machine_or_file_is_made_anew(
         fresh.bake(about())
 
 
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda whole: whole[: len(whole) // 2],
+        lambda whole: "",
+        lambda whole: "[]",
+        lambda whole: "{}",
+        lambda whole: whole.replace('"seconds"', '"hours"', 1),
+        lambda whole: whole.replace('"environment"', '"surroundings"'),
+        lambda whole: whole.replace('"sources"', '"files"'),
+        lambda whole: whole.replace('"bake": {', '"bake": 1, "bait": {'),
+        lambda whole: whole.replace('"machine": {', '"machine": "this one", "engine": {'),
+    ],
+)
+def test_a_bake_whose_note_was_spoilt_is_made_anew(fresh: Workshop, spoil: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    (told,) = fresh.folder.glob("datasets/*/baked.json")
+    whole = told.read_text()
+    assert spoil(whole) != whole
+    told.write_text(spoil(whole))
+    monkeypatch.setattr(trial, "bake", forbidden)
+    with pytest.raises(AssertionError, match="baked again"):
+        fresh.bake(about())
+
+
 def test_a_bake_that_was_cut_off_begins_anew(fresh: Workshop, monkeypatch: pytest.MonkeyPatch) -> None:
     (told,) = fresh.folder.glob("datasets/*/baked.json")
     told.unlink()
