@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from ddprt.runtime.train import fit as fit
     from ddprt.scene.files import load_scene as load_scene
     from ddprt.scene.library import SCENES as SCENES
+    from ddprt.transport.effects import force as force
     from ddprt.transport.effects import plan as plan
     from ddprt.transport.irradiance import irradiance as irradiance
 
@@ -34,6 +35,7 @@ _HOMES = {
     "UserError": "ddprt.errors",
     "bake": "ddprt.dataset.generate",
     "fit": "ddprt.runtime.train",
+    "force": "ddprt.transport.effects",
     "irradiance": "ddprt.transport.irradiance",
     "load_lightings": "ddprt.lights",
     "load_model": "ddprt.runtime.model_file",

@@ -22,8 +22,7 @@ def describe(source: str, overrides: dict[str, str]) -> str:
       overrides: of the configuration.
     """
     from ddprt.dataset.generate import check_points
-    from ddprt.scene.files import load_scene
-    from ddprt.transport.effects import plan
+    from ddprt.transport.effects import configured_scene, plan
     from ddprt.transport.embree import Tracer
     from ddprt.transport.openness import build_open_atlas
 
@@ -31,7 +30,7 @@ def describe(source: str, overrides: dict[str, str]) -> str:
     config = load_config(
         source if configured else None, overrides if configured else {**overrides, "scene.name": f'"{source}"'}
     )
-    scene = load_scene(config.scene.name, **config.scene.parameters)
+    scene = configured_scene(config)
     size = scene.bounds[1] - scene.bounds[0]
     lines = [
         f"scene       {scene.name}: {len(scene.triangles)} triangles, {scene.areas.sum():.4g} m², "

@@ -151,6 +151,13 @@ class TransportConfig(Section):
     threads: int = Field(0, ge=0, description="0: one per core")
 
 
+class EffectsConfig(Section):
+    """What is simulated against the scene's own judgement; `ddprt inspect` lists the names."""
+
+    on: tuple[str, ...] = Field((), description="effects to simulate though the scene does not call for them")
+    off: tuple[str, ...] = Field((), description="effects to leave out though the scene calls for them")
+
+
 class FitConfig(Section):
     """From pairs to a runtime."""
 

@@ -21,7 +21,8 @@ from ddprt.lights import Lighting, parse_lighting
 from ddprt.methods.statuses import STATUSES
 from ddprt.progress import Progress
 from ddprt.runtime.model import Model
-from ddprt.scene.mesh import Material, Scene
+from ddprt.scene.material import Material
+from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import faceted, hollow
 from ddprt.transport.embree import SELF_OFFSET
 

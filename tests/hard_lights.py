@@ -25,7 +25,8 @@ from hard_cases import REFUSED, HardCase, Outcome
 import ddprt
 from ddprt.lights import parse_lighting
 from ddprt.scene.library import build
-from ddprt.scene.mesh import Material, Scene
+from ddprt.scene.material import Material
+from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import faceted
 from ddprt.transport.embree import SELF_OFFSET
 

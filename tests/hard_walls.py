@@ -20,7 +20,8 @@ from hard_bakes import (
 from hard_cases import HardCase, Outcome
 
 from ddprt.scene.checks import checked
-from ddprt.scene.mesh import Material, Scene
+from ddprt.scene.material import Material
+from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import hollow, icosphere
 
 

@@ -14,7 +14,8 @@ from ddprt.scene import unwrap as unwrapping
 from ddprt.scene.atlas import Atlas, build_atlas
 from ddprt.scene.checks import checked
 from ddprt.scene.library import build
-from ddprt.scene.mesh import Material, Scene
+from ddprt.scene.material import Material
+from ddprt.scene.mesh import Scene
 from ddprt.scene.raster import interpolate, rasterise
 
 SIGNIFICANT = 1e-4

@@ -22,7 +22,8 @@ from ddprt.export.textures import export_textures
 from ddprt.files import read_tensors, write_tensors
 from ddprt.lights import Light, Lighting, parse_lighting
 from ddprt.sampling.points import place_samples
-from ddprt.scene.mesh import Material, Scene
+from ddprt.scene.material import Material
+from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import faceted, rectangle
 from ddprt.transport.direct import centred
 from ddprt.transport.embree import Tracer, lifted

@@ -10,7 +10,8 @@ from scipy import stats
 
 from ddprt.lights import Lighting, parse_lighting
 from ddprt.scene.atlas import Atlas, build_atlas
-from ddprt.scene.mesh import Material, Scene
+from ddprt.scene.material import Material
+from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import faceted, rectangle
 from ddprt.transport import direct
 from ddprt.transport.direct import Places, Texels, centred, direct_irradiance, mean_irradiance

@@ -8,7 +8,8 @@ import pytest
 import ddprt
 from ddprt.scene.checks import checked
 from ddprt.scene.library import build
-from ddprt.scene.mesh import Material, Scene
+from ddprt.scene.material import Material
+from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import faceted
 
 mi = pytest.importorskip("mitsuba", reason='needs the extra "reference"')

@@ -14,7 +14,8 @@ from ddprt.report.evaluate import evaluate
 from ddprt.scene.atlas import Atlas, build_atlas
 from ddprt.scene.checks import checked
 from ddprt.scene.library import build
-from ddprt.scene.mesh import Material, Scene
+from ddprt.scene.material import Material
+from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import faceted, icosphere, rectangle
 from ddprt.transport import paths
 from ddprt.transport.embree import Tracer

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ddprt.bench import roofline
-from ddprt.bench.planner import Place, Trial
-from ddprt.bench.tune import Search
+from ddprt.bench.peers import roofline
+from ddprt.bench.tune.planner import Place, Trial
+from ddprt.bench.tune.search import Search
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
 
@@ -111,16 +111,16 @@ def test_cold_models_lie_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(roofline, "cache_bytes", lambda: roofline.Cache(4 * 256 * 3, "told"))
     scenes = frontier.cold_scenes(sizes, 0)
     assert len(scenes.models) == 1 + roofline.BEYOND
-    bases = [frontier.relight_peers.learned(model).basis for model in scenes.models]
+    bases = [frontier.relight.learned(model).basis for model in scenes.models]
     assert len({jnp.asarray(basis).unsafe_buffer_pointer() for basis in bases}) == len(bases)
     assert all(np.array_equal(basis, bases[0]) for basis in bases)
 
 
 def test_who_is_left_out_is_said(capsys: pytest.CaptureFixture[str]) -> None:
-    kept = frontier._kept(frontier.fit_peers.PEERS, frontier.QUICK_FIT)
+    kept = frontier._kept(frontier.fit.PEERS, frontier.QUICK_FIT)
     assert {peer.name for peer in kept} == set(frontier.QUICK_FIT)
     told = capsys.readouterr().out
-    assert all(peer.name in told for peer in frontier.fit_peers.PEERS if peer not in kept)
-    assert {peer.name for peer in frontier._kept(frontier.relight_peers.RELIGHT, frontier.QUICK_RELIGHT)} == set(
+    assert all(peer.name in told for peer in frontier.fit.PEERS if peer not in kept)
+    assert {peer.name for peer in frontier._kept(frontier.relight.RELIGHT, frontier.QUICK_RELIGHT)} == set(
         frontier.QUICK_RELIGHT
     )

@@ -17,7 +17,8 @@ from ddprt.sampling.points import eliminate, load_samples, place_samples
 from ddprt.scene.atlas import SHUT, Atlas
 from ddprt.scene.checks import checked
 from ddprt.scene.library import build
-from ddprt.scene.mesh import Material, Scene
+from ddprt.scene.material import Material
+from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import box, faceted
 from ddprt.sections import LightingsConfig
 from ddprt.transport.embree import Tracer

@@ -9,7 +9,8 @@ from ddprt.errors import UserError
 from ddprt.scene.checks import checked, vertex_normals
 from ddprt.scene.cornell import colour_matching, linear_rgb, spectra
 from ddprt.scene.library import SCENES, build
-from ddprt.scene.mesh import Material, Scene
+from ddprt.scene.material import Material
+from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import box, hollow, icosphere
 
 SMALL = {"furnace": {"subdivisions": 2}, "statue": {"subdivisions": 3}}

@@ -14,7 +14,8 @@ from ddprt.lights import LIGHTS, Lighting, parse_lighting
 from ddprt.scene.atlas import Atlas, build_atlas
 from ddprt.scene.checks import checked
 from ddprt.scene.library import build
-from ddprt.scene.mesh import Material, Scene
+from ddprt.scene.material import Material
+from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import box, faceted, icosphere, rectangle
 from ddprt.transport.effects import EFFECTS, plan, sees_nothing
 from ddprt.transport.embree import Tracer

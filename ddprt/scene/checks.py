@@ -8,8 +8,9 @@ import numpy as np
 
 from ddprt.axes import Float, Int
 from ddprt.errors import UserError
-from ddprt.scene.mesh import Material, Scene
-from ddprt.scene.winding import repeats, welded, winding
+from ddprt.scene.material import Material
+from ddprt.scene.mesh import Scene
+from ddprt.scene.winding import repeats, surfaces, welded, winding
 
 UNSAID = 0.8
 """Albedo where a file names none: that of a matt white wall."""
@@ -19,6 +20,9 @@ NEGLIGIBLE = 1e-8
 
 FARTHEST = 1e15
 """Metres; beyond it squares of lengths leave float32."""
+
+BRIGHTEST = 1e30
+"""W/(m² sr); beyond it sums leave float32."""
 
 
 def checked(
@@ -98,6 +102,15 @@ def checked(
     positions, uv = positions[used], None if uv is None else uv[used]
     given = None if normals is None else np.asarray(_table(name, "normals", normals, 3, len(weld)), dtype=np.float64)[used]
     unit, remark = _shading(positions, triangles, given)
+    backs = _open_backs(weld[used][triangles], np.array([entry.two_sided for entry in materials])[material])
+    if len(backs):
+        first = len(positions)
+        own, corner = np.unique(triangles[backs], return_inverse=True)
+        positions, unit = np.concatenate([positions, positions[own]]), np.concatenate([unit, -unit[own]])
+        uv = None if uv is None else np.concatenate([uv, uv[own]])
+        triangles = np.concatenate([triangles, first + corner.reshape(-1, 3)[:, ::-1]])
+        material = np.concatenate([material, material[backs]])
+        remark.append(f"{len(backs)} triangles of two-sided materials have a back of their own")
     return Scene(
         name,
         positions,
@@ -133,6 +146,17 @@ def vertex_normals(
     return np.where(size > 1e-9, total / np.maximum(size, 1e-9), some)
 
 
+def _open_backs(corners: np.ndarray, two_sided: np.ndarray) -> np.ndarray:
+    """Triangles of two-sided materials whose back may be seen: those of surfaces that are not closed.
+
+    Exporters call most closed bodies two-sided too; nobody sees these from inside.
+    """
+    if not two_sided.any():
+        return np.flatnonzero(two_sided)
+    surface, is_closed = surfaces(corners)
+    return np.flatnonzero(two_sided & ~is_closed[surface])
+
+
 def _table(name: str, what: str, rows: np.ndarray, columns: int, length: int | None = None) -> np.ndarray:
     rows = np.asarray(rows)
     expected = f"({'n' if length is None else length}, {columns})"
@@ -165,21 +189,27 @@ def _finite(name: str, what: str, rows: np.ndarray, triangles: np.ndarray) -> No
 
 
 def _reflects(name: str, material: Material, uv: np.ndarray | None) -> None:
+    of = f'of material "{material.name}"'
     albedo = np.asarray(material.albedo, dtype=np.float64)
     if albedo.shape != (3,) or not ((albedo >= 0) & (albedo <= 1)).all():
-        raise UserError(
-            f'{name}: got albedo {material.albedo} of material "{material.name}", expected three numbers 0 to 1; correct it'
-        )
-    if (texture := material.texture) is None:
-        return
-    if texture.ndim != 3 or texture.shape[2] != 3 or not texture.size or not ((texture >= 0) & (texture <= 1)).all():
-        raise UserError(
-            f'{name}: got a texture of material "{material.name}" that is not (height, width, 3) with values 0 to 1; correct it'
-        )
-    if uv is None:
-        raise UserError(
-            f'{name}: got a texture of material "{material.name}" but no texture coordinates; unwrap it or drop the texture'
-        )
+        raise UserError(f"{name}: got albedo {material.albedo} {of}, expected three numbers 0 to 1; correct it")
+    for what, image in material.textures.items():
+        channels = {"opacity": (), "gloss": (2,)}.get(what, (3,))
+        sound = image.ndim == 2 + len(channels) and image.shape[2:] == channels and image.size
+        if not sound or not ((image >= 0) & (image <= 1)).all():
+            shape = ", ".join(["height", "width", *map(str, channels)])
+            texture = "texture" if what == "albedo" else f"texture of {what}"
+            raise UserError(f"{name}: got a {texture} {of} that is not ({shape}) with values 0 to 1; correct it")
+        if uv is None:
+            raise UserError(f"{name}: got a texture {of} but no texture coordinates; unwrap it or drop the texture")
+    radiance = np.asarray(material.emission.radiance if material.emission else (0, 0, 0), np.float64)
+    if radiance.shape != (3,) or not ((radiance >= 0) & (radiance <= BRIGHTEST)).all():
+        raise UserError(f"{name}: got radiance {radiance.tolist()} {of}, expected three numbers 0 to {BRIGHTEST:g}; correct it")
+    gloss = material.gloss
+    if gloss and not all(0 <= value <= 1 for value in (gloss.roughness, gloss.metallic, gloss.dielectric)):
+        raise UserError(f"{name}: got {gloss} {of}, expected roughness, metallic and dielectric from 0 to 1; correct it")
+    if material.cutout and not 0 <= material.cutout.cutoff <= 1:
+        raise UserError(f"{name}: got cutoff {material.cutout.cutoff:g} {of}, expected 0 to 1; correct it")
 
 
 def _sheets(corners: np.ndarray, turned: np.ndarray) -> str:

@@ -10,7 +10,8 @@ import numpy as np
 
 from ddprt.axes import Float, Rgb
 from ddprt.errors import UserError
-from ddprt.scene.mesh import Material, Scene
+from ddprt.scene.material import Material
+from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import faceted, rectangle
 
 # Millimetres, counter-clockwise from the front.

@@ -17,7 +17,8 @@ from ddprt.axes import Float, Float64, Int
 from ddprt.scene.accessors import Container, open_gltf
 from ddprt.scene.checks import UNSAID, checked
 from ddprt.scene.images import linear_image
-from ddprt.scene.mesh import Material, Scene
+from ddprt.scene.material import Material
+from ddprt.scene.mesh import Scene
 
 REFUSED = {
     "KHR_draco_mesh_compression": "export without Draco compression",

@@ -4,27 +4,14 @@ Metres, right-handed, Y up. A triangle's front is where its corners run counter-
 """
 
 import hashlib
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from ddprt.axes import Float, Float64, Int, Int32
-
-
-@dataclass(frozen=True)
-class Material:
-    """A diffuse surface.
-
-    Attributes:
-      name: for messages.
-      albedo: linear Rec.709 reflectance, each 0 to 1.
-      texture: (height, width, 3) linear factor on the albedo, row 0 at the top, or None.
-    """
-
-    name: str
-    albedo: tuple[float, float, float]
-    texture: np.ndarray | None = field(default=None, repr=False, compare=False)
+from ddprt.scene.material import Material, bilinear
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +27,8 @@ class Scene:
       materials: at least one.
       uv: texture coordinates per vertex, origin top-left, or None where no material has a texture.
       notes: what the checks repaired, one line each.
+      whole: the scene that this one is, when a user has left effects out of it; see `ddprt.transport.effects.force`.
+      forced: effects that a user wants simulated whatever the materials say.
     """
 
     name: str
@@ -50,6 +39,8 @@ class Scene:
     materials: tuple[Material, ...]
     uv: Float64[np.ndarray, "vertices 2"] | None = None
     notes: tuple[str, ...] = ()
+    whole: "Scene | None" = None
+    forced: tuple[str, ...] = ()
 
     @cached_property
     def corners(self) -> Float64[np.ndarray, "triangles 3 3"]:
@@ -95,7 +86,26 @@ class Scene:
             if array is not None:
                 state.update(str(array.shape).encode() + np.ascontiguousarray(array).tobytes())
         state.update(repr([material.albedo for material in self.materials]).encode())
+        for index, material in enumerate(self.materials):
+            for part in (material.cutout, material.emission, material.gloss):
+                if part is not None:
+                    state.update(f"{index} {part}".encode())
+            for name, image in material.textures.items():
+                if name != "albedo":
+                    state.update(f"{index} {name} {image.shape}".encode() + np.ascontiguousarray(image).tobytes())
+        state.update(repr(self.forced).encode() if self.forced else b"")
         return state.hexdigest()[:16]
+
+    @cached_property
+    def used_materials(self) -> tuple[Material, ...]:
+        """Those that some triangle has."""
+        return tuple(self.materials[index] for index in np.unique(self.material))
+
+    def made_of(self, change: Callable[[Material], Material]) -> "Scene":
+        """The same shape of other materials."""
+        materials = tuple(map(change, self.materials))
+        same = all(new is old for new, old in zip(materials, self.materials, strict=True))
+        return self if same else replace(self, materials=materials)
 
     def albedo_at(self, triangle: Int[np.ndarray, " n"], barycentric: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Linear albedo at points given by triangle and weights of its three corners."""
@@ -103,22 +113,14 @@ class Scene:
         albedo = np.array([entry.albedo for entry in self.materials])[material]
         if self.uv is None:
             return albedo
-        uv = np.einsum("nc,ncd->nd", barycentric, self.uv[self.triangles[triangle]])
+        uv = self.uv_at(triangle, barycentric)
         for index, entry in enumerate(self.materials):
             if entry.texture is not None:
                 chosen = material == index
-                albedo[chosen] *= _bilinear(entry.texture, uv[chosen])
+                albedo[chosen] *= bilinear(entry.texture, uv[chosen])
         return albedo
 
-
-def _bilinear(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Repeating bilinear lookup, texel centres at half-integers."""
-    height, width = image.shape[:2]
-    position = uv * [width, height] - 0.5
-    corner = np.floor(position).astype(int)
-    fx, fy = (position - corner).T[..., None]
-    x0, y0 = corner[:, 0] % width, corner[:, 1] % height
-    x1, y1 = (x0 + 1) % width, (y0 + 1) % height
-    top = image[y0, x0] * (1 - fx) + image[y0, x1] * fx
-    bottom = image[y1, x0] * (1 - fx) + image[y1, x1] * fx
-    return top * (1 - fy) + bottom * fy
+    def uv_at(self, triangle: Int[np.ndarray, " n"], barycentric: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+        """Texture coordinates at such points; the scene must have some."""
+        assert self.uv is not None
+        return np.einsum("nc,ncd->nd", barycentric, self.uv[self.triangles[triangle]])

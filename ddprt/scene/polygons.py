@@ -18,7 +18,8 @@ from ddprt.axes import Float, Int
 from ddprt.errors import UserError
 from ddprt.scene.checks import UNSAID, checked
 from ddprt.scene.images import linear_image, srgb_to_linear
-from ddprt.scene.mesh import Material, Scene
+from ddprt.scene.material import Material
+from ddprt.scene.mesh import Scene
 
 EXACT_COLOURS = 4096
 """Different colours that each become a material; where a file has more, they are rounded to 32 levels per channel."""

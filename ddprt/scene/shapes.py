@@ -5,7 +5,8 @@ import numpy as np
 from ddprt.axes import Bool, Float, Int
 from ddprt.errors import UserError
 from ddprt.scene.checks import checked, vertex_normals
-from ddprt.scene.mesh import Material, Scene
+from ddprt.scene.material import Material
+from ddprt.scene.mesh import Scene
 
 FINEST = 8
 """Subdivisions of an icosphere: 1.3 M triangles."""

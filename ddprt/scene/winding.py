@@ -74,3 +74,22 @@ def winding(
     # Where the two labels are one, nothing is `turned` and so nothing is a majority: such surfaces stay as they are.
     one_sided = label == mirror
     return turned ^ majority[surface], len(np.unique(surface[one_sided]))
+
+
+def surfaces(corners: Int[np.ndarray, "triangles 3"]) -> tuple[Int[np.ndarray, " triangles"], Bool[np.ndarray, " surfaces"]]:
+    """Which triangles hang together by edges, and whether each such surface is closed: every edge has a triangle on each side.
+
+    Args:
+      corners: place of each corner, wound alike.
+    """
+    count = len(corners)
+    start, end = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
+    edges, edge = np.unique(np.sort(np.stack([start, end], 1), axis=1), axis=0, return_inverse=True)
+    owner, number = np.repeat(np.arange(count), 3), edge.ravel()
+    joined = coo_array((np.ones(3 * count, bool), (owner, count + number)), shape=(count + len(edges),) * 2)
+    surface = connected_components(joined, directed=False)[1]
+    balance = np.bincount(number, np.where(start < end, 1, -1), len(edges))
+    is_closed = np.ones(surface.max() + 1, bool)
+    is_closed[surface[count:][balance != 0]] = False
+    _, own = np.unique(surface[:count], return_inverse=True)
+    return own, is_closed[np.unique(surface[:count])]

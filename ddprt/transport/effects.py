@@ -1,16 +1,23 @@
 """Simulate only the effects a scene calls for.
 
 An effect is a part of light transport that some scenes lack. The plan says for each: called for or not, why, and, where it
-is left out, an upper bound of the light it could have added.
+is left out, an upper bound of the light it could have added. A new effect is one file, which is not even imported unless a
+plan calls for it, and one entry of `EFFECTS`, which decides by what scene and lightings say of themselves.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from importlib import import_module
+from types import ModuleType
 
 import numpy as np
 
 from ddprt.catalogue import Catalogue
+from ddprt.config import Config
+from ddprt.errors import UserError
 from ddprt.lights import LIGHTS, Lighting, parse_lighting
+from ddprt.scene.files import load_scene
+from ddprt.scene.material import Material
 from ddprt.scene.mesh import Scene
 
 _FLAT = 1e-6  # of the radius: how far a corner may stand before a triangle's plane and still be in it
@@ -52,26 +59,108 @@ class Plan:
         """Whether an effect is simulated."""
         return any(effect.called for effect in self.effects if effect.name == name)
 
+    def module(self, name: str) -> ModuleType | None:
+        """The file of an effect, imported now; None where it is not called for."""
+        return import_module(f"ddprt.transport.{EFFECTS[name].module}") if self.called(name) else None
+
+
+@dataclass(frozen=True)
+class Question:
+    """What a plan is made from.
+
+    Attributes:
+      scene, lightings: of the bake.
+      bounces: asked for; -1 lets the scene decide.
+    """
+
+    scene: Scene
+    lightings: Sequence[Lighting]
+    bounces: int = -1
+
+    def users(self, has: Callable[[Material], object]) -> str:
+        """The materials in use that have something, in words; empty where none has."""
+        found = [f'"{material.name}"' for material in self.scene.used_materials if has(material)]
+        return f"material {', '.join(found[:3])}{f' and {len(found) - 3} more' if len(found) > 3 else ''}" if found else ""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """How an effect is decided on, and where it lives.
+
+    Attributes:
+      decide: the line of a plan that nobody forces; never imports the effect's file.
+      module: its file in `ddprt.transport`; empty for what transport always has.
+      without: the scene with what calls for the effect taken out; None where it cannot be forced.
+      left: bound of the light left out when it is forced off; None where it is unbounded.
+    """
+
+    decide: Callable[[str, Question], Effect]
+    module: str = ""
+    without: Callable[[Scene], Scene] | None = None
+    left: Callable[[Question], float | None] = lambda question: None
+
 
 def plan(scene: Scene, lightings: Sequence[Lighting], *, bounces: int = -1) -> Plan:
     """Decides what to simulate.
 
     Args:
-      scene: its materials and shape.
+      scene: its materials and shape; from `force` where the user decides.
       lightings: all that will be baked.
       bounces: -1 lets the scene decide; 0 and up is forced.
     """
     parsed = [parse_lighting(lighting, f"lighting {index}") for index, lighting in enumerate(lightings)]
-    effects = tuple(decide(name, scene, parsed, bounces) for name, decide in EFFECTS.items())
+    effects = tuple(_decided(name, entry, Question(scene, parsed, bounces)) for name, entry in EFFECTS.items())
     return Plan(effects, bounces if effects[0].called else 0)
 
 
-def _diffuse_bounces(name: str, scene: Scene, lightings: Sequence[Lighting], bounces: int) -> Effect:
-    brightest = max(scene.materials, key=lambda material: max(material.albedo))
+def force(scene: Scene, *, on: Sequence[str] = (), off: Sequence[str] = ()) -> Scene:
+    """A scene whose plan simulates some effects, or leaves them out, whatever it calls for by itself.
+
+    Args:
+      scene: from `ddprt.load_scene`.
+      on, off: entries of `EFFECTS`. What is off is left out by taking out of the scene what calls for it.
+    Raises:
+      UserError: unknown names, effects that cannot be forced, or both on and off.
+    """
+    for name in (*on, *off):
+        if EFFECTS[name].without is None:
+            can = ", ".join(f'"{name}"' for name, entry in EFFECTS.items() if entry.without)
+            also = "; transport.bounces forces those" if name == "diffuse bounces" else ""
+            raise UserError(f'effects: got "{name}", which cannot be forced, expected some of {can}{also}')
+        if name in on and name in off:
+            raise UserError(f'effects: got "{name}" both on and off, expected one or the other; choose')
+    whole, left = scene.whole or scene, scene
+    for name in off:
+        without = EFFECTS[name].without
+        left = without(left) if without else left
+    return replace(left, whole=whole if left is not whole else None, forced=tuple(sorted({*scene.forced, *on})))
+
+
+def configured_scene(config: Config) -> Scene:
+    """The scene of a configuration, with the effects that it forces."""
+    return force(load_scene(config.scene.name, **config.scene.parameters), on=config.effects.on, off=config.effects.off)
+
+
+def _decided(name: str, entry: Entry, question: Question) -> Effect:
+    effect, whole = entry.decide(name, question), question.scene.whole
+    if effect.called:
+        return effect
+    if name in question.scene.forced:
+        return replace(effect, called=True, why=f"forced on, though {effect.why}", bound=0.0, forced=True)
+    asked = replace(question, scene=whole) if whole else question
+    wished = entry.decide(name, asked)
+    if entry.without and wished.called:
+        return Effect(name, False, f"forced off, though it is called for: {wished.why}", entry.left(asked), True)
+    return effect
+
+
+def _diffuse_bounces(name: str, question: Question) -> Effect:
+    bounces = question.bounces
+    brightest = max(question.scene.materials, key=lambda material: max(material.albedo))
     albedo = max(brightest.albedo)
     if albedo == 0:
         return Effect(name, False, "every material is black")
-    if sees_nothing(scene):
+    if sees_nothing(question.scene):
         return Effect(name, False, "no surface faces another: the scene is convex seen from outside")
     if bounces >= 0:
         left = albedo ** (bounces + 1) / (1 - albedo) if albedo < 1 else None
@@ -82,17 +171,29 @@ def _diffuse_bounces(name: str, scene: Scene, lightings: Sequence[Lighting], bou
     return Effect(name, True, why)
 
 
-def _light_kind(kind: str) -> Callable[[str, Scene, Sequence[Lighting], int], Effect]:
-    def decide(name: str, scene: Scene, lightings: Sequence[Lighting], bounces: int) -> Effect:
+def _light_kind(kind: str) -> Entry:
+    def decide(name: str, question: Question) -> Effect:
+        lightings = question.lightings
         users = [index for index, lighting in enumerate(lightings) if any(light.kind == kind for light in lighting)]
         why = f"{len(users)} of {len(lightings)} lightings, first {users[0]}" if users else "no lighting has one"
         return Effect(name, bool(users), why)
 
+    return Entry(decide)
+
+
+def _material(has: Callable[[Material], object], lacking: str) -> Callable[[str, Question], Effect]:
+    """Called for where a material in use has something."""
+
+    def decide(name: str, question: Question) -> Effect:
+        users = question.users(has)
+        return Effect(name, bool(users), users or lacking)
+
     return decide
 
 
-EFFECTS: Catalogue[Callable[[str, Scene, Sequence[Lighting], int], Effect]] = Catalogue(
-    "effect", {"diffuse bounces": _diffuse_bounces, **{f"{kind} lights": _light_kind(kind) for kind in LIGHTS}}
+EFFECTS: Catalogue[Entry] = Catalogue(
+    "effect",
+    {"diffuse bounces": Entry(_diffuse_bounces), **{f"{kind} lights": _light_kind(kind) for kind in LIGHTS}},
 )
 
 

@@ -1,0 +1,97 @@
+"""What a surface does with light. Whatever is not plain diffuse reflection is a part of its own, and None where there is none.
+
+So a scene says by itself which effects it calls for: one without a `Cutout` has no holes to look for.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ddprt.axes import Float, Float32
+
+
+@dataclass(frozen=True)
+class Cutout:
+    """Holes in a surface, as in leaves and fences: what is less opaque than the cutoff is not there.
+
+    Attributes:
+      opacity: (height, width), 0 to 1, row 0 at the top, looked up by the material's texture coordinates.
+      cutoff: least opacity that stops light.
+    """
+
+    opacity: Float32[np.ndarray, "height width"] = field(repr=False, compare=False)
+    cutoff: float = 0.5
+
+
+@dataclass(frozen=True)
+class Emission:
+    """Light that a surface's front sends out by itself, the same in all directions and at all times.
+
+    Attributes:
+      radiance: linear Rec.709, W/(m² sr).
+      texture: (height, width, 3) linear factor, row 0 at the top, or None.
+    """
+
+    radiance: tuple[float, float, float]
+    texture: Float32[np.ndarray, "height width 3"] | None = field(default=None, repr=False, compare=False)
+
+
+@dataclass(frozen=True)
+class Gloss:
+    """Reflection about the mirror direction: the metal-rough model of glTF 2.0 (GGX with Smith's shadowing, Schlick's Fresnel).
+
+    The material's albedo is the base colour: a metal reflects it about the mirror direction and scatters nothing.
+
+    Attributes:
+      roughness: perceptual, 0 to 1; its square is the width of the lobe.
+      metallic: 0 to 1.
+      dielectric: reflectance at normal incidence of what is not metal.
+      texture: (height, width, 2) factors on roughness and metallic, row 0 at the top, or None.
+    """
+
+    roughness: float = 1.0
+    metallic: float = 0.0
+    dielectric: float = 0.04
+    texture: Float32[np.ndarray, "height width 2"] | None = field(default=None, repr=False, compare=False)
+
+
+@dataclass(frozen=True)
+class Material:
+    """A surface. Textures of one material share its texture coordinates.
+
+    Attributes:
+      name: for messages.
+      albedo: linear Rec.709 reflectance, each 0 to 1.
+      texture: (height, width, 3) linear factor on the albedo, row 0 at the top, or None.
+      two_sided: the back reflects as the front does; `checked` makes surfaces of their own of such backs.
+      cutout, emission, gloss: what there is besides.
+    """
+
+    name: str
+    albedo: tuple[float, float, float]
+    texture: np.ndarray | None = field(default=None, repr=False, compare=False)
+    two_sided: bool = False
+    cutout: Cutout | None = field(default=None, repr=False)
+    emission: Emission | None = field(default=None, repr=False)
+    gloss: Gloss | None = field(default=None, repr=False)
+
+    @property
+    def textures(self) -> dict[str, np.ndarray]:
+        """All images, by what they change."""
+        parts = (("emission", self.emission), ("gloss", self.gloss))
+        found = {"albedo": self.texture, **{name: part.texture for name, part in parts if part}}
+        found |= {"opacity": self.cutout.opacity} if self.cutout else {}
+        return {name: image for name, image in found.items() if image is not None}
+
+
+def bilinear(image: Float[np.ndarray, "height width ..."], uv: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n ..."]:
+    """Repeating bilinear lookup, texel centres at half-integers."""
+    height, width = image.shape[:2]
+    position = uv * [width, height] - 0.5
+    corner = np.floor(position).astype(int)
+    fx, fy = (position - corner).T.reshape(2, -1, *(1,) * (image.ndim - 2))
+    x0, y0 = corner[:, 0] % width, corner[:, 1] % height
+    x1, y1 = (x0 + 1) % width, (y0 + 1) % height
+    top = image[y0, x0] * (1 - fx) + image[y0, x1] * fx
+    bottom = image[y1, x0] * (1 - fx) + image[y1, x1] * fx
+    return top * (1 - fy) + bottom * fy
