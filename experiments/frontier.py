@@ -35,9 +35,7 @@ from ddprt.bench.budget.budget import measure_budget
 from ddprt.bench.measure.settings import Setting
 from ddprt.bench.measure.trial import Workshop, environment, measured_here
 from ddprt.bench.measure.yardstick import make_yardstick
-from ddprt.bench.peers import fit as fit_peers
-from ddprt.bench.peers import relight as relight_peers
-from ddprt.bench.peers import roofline
+from ddprt.bench.peers import fit, relight, roofline
 from ddprt.bench.peers.peers import GRAM, Sizes, measure, table
 from ddprt.bench.peers.standing import OURS, Peer, Row, best, compare
 from ddprt.bench.tune.planner import Place, Trial
@@ -97,13 +95,13 @@ def quick_peers(base: Config) -> dict[str, float | None]:
     """The fit of a twentieth of the texels and cold frames, beside the fastest accurate peers of the whole comparison alone."""
     sizes = Sizes(texels=50_000, repeats=3)
     with threadpool_limits(limits=roofline.threads()):
-        spectrum = fit_peers.real_spectrum(base, 3 * sizes.lightings, QUIET)
-        maps = fit_peers.Maps(fit_peers.make_columns(spectrum, sizes.texels, base.seed), sizes.bases)
-        fits = compare(_kept(fit_peers.PEERS, QUICK_FIT), maps, repeats=sizes.repeats)
+        spectrum = fit.real_spectrum(base, 3 * sizes.lightings, QUIET)
+        maps = fit.Maps(fit.make_columns(spectrum, sizes.texels, base.seed), sizes.bases)
+        fits = compare(_kept(fit.PEERS, QUICK_FIT), maps, repeats=sizes.repeats)
         show(f"fit of {sizes.bases} bases to {len(spectrum)} columns x {sizes.texels} texels", fits)
         del maps
         scenes = cold_scenes(sizes, base.seed)
-        frames = compare(_kept(relight_peers.RELIGHT, QUICK_RELIGHT), scenes, repeats=3 * sizes.repeats)
+        frames = compare(_kept(relight.RELIGHT, QUICK_RELIGHT), scenes, repeats=3 * sizes.repeats)
         moved = scenes.moved
         show(f"a frame of {sizes.side} x {sizes.side} texels, {len(scenes.models)} models in turn", frames)
         del scenes
@@ -132,15 +130,15 @@ def show(what: str, rows: Sequence[Row]) -> None:
         print(f"  {row.name}: {took}, {row.verdict}{f'; {row.reason}' if row.verdict == 'skipped' else ''}", flush=True)
 
 
-def cold_scenes(sizes: Sizes, seed: int) -> relight_peers.Scenes:
+def cold_scenes(sizes: Sizes, seed: int) -> relight.Scenes:
     """As many models as no cache holds: copies of one in memory of their own, which is all that bandwidth asks for."""
     texels = sizes.side**2
-    first = relight_peers.make_model(texels, sizes.bases, sizes.points, seed)
-    linear = relight_peers.learned(first)
+    first = relight.make_model(texels, sizes.bases, sizes.points, seed)
+    linear = relight.learned(first)
     count = 1 + -(-roofline.BEYOND * roofline.cache_bytes().bytes // (4 * texels * sizes.bases))
     copies = [replace(first, relighter=replace(linear, basis=jnp.array(linear.basis, copy=True))) for _ in range(count - 1)]
     values = np.random.default_rng(seed).random((sizes.points, 3), np.float32)
-    return relight_peers.Scenes([first, *copies], values)
+    return relight.Scenes([first, *copies], values)
 
 
 def budget_closure(folder: Path, quick: bool) -> float:

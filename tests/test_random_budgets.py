@@ -39,7 +39,7 @@ def visited(monkeypatch: pytest.MonkeyPatch) -> list[Place]:
     def measure(_: Search, place: Place) -> Trial:
         seen.append(place)
         if len(seen) == 4:
-            raise KeyboardInterrupt
+            raise RuntimeError("power cut")
         return replace(TRIAL, place=place, bake_seconds=float(len(seen)))
 
     monkeypatch.setattr(Search, "measure", measure)
@@ -47,7 +47,7 @@ def visited(monkeypatch: pytest.MonkeyPatch) -> list[Place]:
 
 
 def test_a_grid_goes_on_where_it_was_stopped(visited: list[Place], tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(RuntimeError, match="power cut"):
         frontier.Contest("cornell", tmp_path, quick=True).grid()
     known = frontier.Contest("cornell", tmp_path, quick=True).grid()
     assert visited[3] == visited[4]  # the place that was cut off
@@ -111,16 +111,16 @@ def test_cold_models_lie_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(roofline, "cache_bytes", lambda: roofline.Cache(4 * 256 * 3, "told"))
     scenes = frontier.cold_scenes(sizes, 0)
     assert len(scenes.models) == 1 + roofline.BEYOND
-    bases = [frontier.relight_peers.learned(model).basis for model in scenes.models]
+    bases = [frontier.relight.learned(model).basis for model in scenes.models]
     assert len({jnp.asarray(basis).unsafe_buffer_pointer() for basis in bases}) == len(bases)
     assert all(np.array_equal(basis, bases[0]) for basis in bases)
 
 
 def test_who_is_left_out_is_said(capsys: pytest.CaptureFixture[str]) -> None:
-    kept = frontier._kept(frontier.fit_peers.PEERS, frontier.QUICK_FIT)
+    kept = frontier._kept(frontier.fit.PEERS, frontier.QUICK_FIT)
     assert {peer.name for peer in kept} == set(frontier.QUICK_FIT)
     told = capsys.readouterr().out
-    assert all(peer.name in told for peer in frontier.fit_peers.PEERS if peer not in kept)
-    assert {peer.name for peer in frontier._kept(frontier.relight_peers.RELIGHT, frontier.QUICK_RELIGHT)} == set(
+    assert all(peer.name in told for peer in frontier.fit.PEERS if peer not in kept)
+    assert {peer.name for peer in frontier._kept(frontier.relight.RELIGHT, frontier.QUICK_RELIGHT)} == set(
         frontier.QUICK_RELIGHT
     )
