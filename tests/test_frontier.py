@@ -127,6 +127,11 @@ def test_nothing_is_measured_twice(again: Path, measured: list[str]) -> None:
     assert sorted(measured) == FAILING, "only what failed is tried again"
 
 
+def test_a_sweep_of_more_repeats_is_measured_anew(again: Path, measured: list[str]) -> None:
+    quiet(base(sweep={"fit.bases": (2,)}, bench__repeats=2), again)
+    assert measured == ["as configured", "fit.bases = 2"]
+
+
 def test_other_sweeps_find_theirs(again: Path, measured: list[str]) -> None:
     quiet(base(sweep={"fit.bases": (2,)}), again)
     assert measured == []
@@ -165,11 +170,12 @@ def edited(path: Path, name: str, change: Callable[[dict[str, Any]], Any]) -> No
         lambda record: record.update(remarks="none"),
         lambda record: record.update(remarks=[{}, {}]),
         lambda record: record.pop("name"),
+        lambda record: record.update(repeats="many"),
     ],
     ids=[
         *("machine", "version", "truth", "files", "schema", "no outcome", "no surroundings", "no date", "no machine"),
         *("no packages", "no scores", "score in words", "no score", "no bake", "no bytes", "no configuration", "no changes"),
-        *("no remarks", "no words", "no name"),
+        *("no remarks", "no words", "no name", "repeats in words"),
     ],
 )
 def test_what_does_not_compare_is_measured_anew(again: Path, measured: list[str], change: Any) -> None:

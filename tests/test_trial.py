@@ -34,7 +34,8 @@ SMALL: dict[str, Any] = {
 }
 BASE = checked(SMALL)
 KEYS = {
-    *("schema", "digest", "digest_bake", "name", "changes", "config", "failed", "truth", "sources", "scores", "floors", "bake"),
+    *("schema", "digest", "digest_bake", "name", "changes", "config", "failed", "truth", "sources", "repeats"),
+    *("scores", "floors", "bake"),
     *("fit", "frame", "batch", "coefficients", "bytes", "flops", "bases", "method", "status", "remarks", "environment"),
 }
 TIMES = {"median", "low", "high", "compile", "repeats"}
@@ -327,10 +328,19 @@ def test_records_hold_until_something_differs(shop: Workshop, record: dict[str, 
         {"truth": "another"},
         {"sources": "others"},
         {"environment": {**record["environment"], "ddprt": "0"}},
+        {"repeats": 0},
     ):
         assert not shop.holds({**record, **other}, about()), other
     assert not shop.holds({}, about())
     assert not measured_here({**record["environment"], "machine": {}})
+
+
+def test_more_repeats_than_were_asked_for_are_measured_anew(shop: Workshop, record: dict[str, Any]) -> None:
+    """What counts is what was asked: where a fit takes long fewer are made, and no other run would make more."""
+    again = replace(shop, config=changed(BASE, {"bench.repeats": 5}))
+    assert not again.holds(record, about())
+    assert again.holds({**record, "repeats": 5, "fit": {**record["fit"], "repeats": 2}}, about())
+    assert shop.holds({**record, "repeats": 5}, about()), "fewer are asked for"
 
 
 def test_forgetting_removes_what_it_says(shop: Workshop, record: dict[str, Any], tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from ddprt.progress import Progress
 RESULTS = "results.jsonl"
 _ALWAYS = {"digest": str, "name": str, "changes": dict, "config": str, "failed": str | None, "environment": dict}
 _SURROUNDINGS = {"ddprt": str, "commit": str | None, "when": str, "machine": dict}
-_MEASURED = {"scores": dict, "floors": dict, "status": str, "remarks": list}
+_MEASURED = {"repeats": int, "scores": dict, "floors": dict, "status": str, "remarks": list}
 
 
 def sweep(config: Config, folder: Path, progress: Progress) -> list[Path]:

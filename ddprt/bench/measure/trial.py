@@ -160,12 +160,13 @@ class Workshop:
             shutil.rmtree(folder, ignore_errors=True)
 
     def holds(self, record: dict[str, Any], setting: Setting) -> bool:
-        """Whether a setting was measured on this truth, from these files, by this version, on a machine like this."""
+        """Whether a setting was measured on this truth, from these files, by this version, on a machine like this, as often."""
         return (
             record.get("schema") == SCHEMA
             and not record.get("failed", True)
             and record.get("truth") == self.truth
             and record.get("sources") == self.sources(setting.config)
+            and record.get("repeats", 0) >= self.config.bench.repeats
             and measured_here(record["environment"])
         )
 
@@ -191,6 +192,7 @@ class Workshop:
             "failed": None,
             "truth": self.truth,
             "sources": self.sources(config),
+            "repeats": repeats,  # that were asked for; of what takes long fewer are made
             "scores": self.yardstick.score(model),
             "floors": {
                 "noise_relative_rmse": self.yardstick.noise,
