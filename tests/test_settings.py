@@ -53,6 +53,8 @@ def test_settings_that_share_a_dataset_stand_together() -> None:
         ("transport.target_noise", 0.5, False),
         ("atlas.resolution", 64, False),
         ("scene.name", "corridor", False),
+        ("effects.on", ["gloss"], False),
+        ("effects.off", ["gloss"], False),
     ],
 )
 def test_only_what_training_maps_depend_on_asks_for_another_bake(key: str, value: Any, same: bool) -> None:

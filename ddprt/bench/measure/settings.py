@@ -14,7 +14,7 @@ from ddprt.methods import METHODS
 
 ASKED = ("bench", "sweep", "budget", "tune", "report")
 """Sections that say what is measured, not what is made."""
-BAKED = ("scene", "atlas", "lightings", "points", "transport")
+BAKED = ("scene", "atlas", "lightings", "points", "transport", "effects")
 """Sections that a dataset depends on."""
 _HALVINGS = (8, 4, 2)
 _SENDERS = 128  # along a side, at most, where transport.sender_resolution is 0
