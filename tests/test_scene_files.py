@@ -230,13 +230,14 @@ def test_what_is_ignored_is_listed_once(tmp_path: Path) -> None:
     writer = one(material=0)
     writer.mesh(mode=1)
     writer.node(mesh=1)
-    writer.json["materials"] = [
-        {"emissiveFactor": [1, 0, 0], "alphaMode": "BLEND", "doubleSided": True, "pbrMetallicRoughness": {}}
-    ]
+    writer.json["materials"] = [{"emissiveFactor": [1, 0, 0], "alphaMode": "MASK", "pbrMetallicRoughness": {}}] * 2
+    writer.json["materials"][1] = {"normalTexture": {"index": 0}, "occlusionTexture": {"index": 0}}
+    writer.mesh(material=1, positions=TRIANGLE + FACING)
+    writer.node(mesh=2)
     writer.json["extensionsUsed"] = ["KHR_lights_punctual"]
     scene = load_scene(writer.glb(tmp_path / "much.glb"))
     (note,) = scene.notes
-    for word in ("KHR_lights_punctual", "alpha", "double-sided", "emissive", "metallic", "points and lines"):
+    for word in ("KHR_lights_punctual", "normal maps", "occlusion maps", "points and lines"):
         assert note.count(word) == 1
 
 

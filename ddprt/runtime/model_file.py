@@ -22,6 +22,7 @@ from ddprt.methods.method import FitReport
 from ddprt.runtime.model import Model
 from ddprt.runtime.trust import Yardstick
 from ddprt.sampling.points import Samples
+from ddprt.scene.holes import Holes
 
 SCHEMA = 1
 
@@ -78,6 +79,8 @@ def save_model(model: Model, folder: Path) -> None:
     }
     if model.uv is not None:
         tensors["scene.uv"] = model.uv
+    if model.holes is not None:
+        tensors |= model.holes.tensors
     trust: dict[str, float] = {}
     if model.yardstick is not None:
         for entry in fields(model.yardstick):
@@ -195,6 +198,7 @@ def _assemble(document: dict[str, Any], checked: _Document, tensors: dict[str, n
         document["scene"],
         uv,
         None if checked.trust is None else _yardstick(checked.trust, tensors),
+        Holes.read(tensors, len(tensors["scene.corners"])),
     )
 
 
