@@ -180,8 +180,8 @@ def without_holes(atlas: Atlas, scene: Scene, holes: Holes) -> Atlas:
     if not len(masked):
         return atlas
     triangle, corners = atlas.piece_triangle[masked], atlas.piece_corners[masked]
-    place = (scene.corners - atlas.centre)[triangle]
-    weights = np.stack([weights_at(place, corners[:, corner].astype(np.float64)) for corner in range(3)], 1)
+    around = (scene.corners - atlas.centre)[triangle]
+    weights = np.stack([weights_at(around, corners[:, corner].astype(np.float64)) for corner in range(3)], 1)
     row = holes.row[triangle]
     uv = np.einsum("nkc,ncd->nkd", weights, holes.uv[row])
     pixels = (np.ptp(uv, axis=1) * holes.size[holes.image[row], ::-1]).max(1)
@@ -202,18 +202,12 @@ def without_holes(atlas: Atlas, scene: Scene, holes: Holes) -> Atlas:
     kept[masked[~whole]] = False
     old, home = np.flatnonzero(kept), masked[origin]
     small = np.einsum("nkc,ncd->nkd", cut, corners[origin].astype(np.float64)).astype(np.float32)
-    area = atlas.piece_area[home] * np.abs(np.linalg.det(cut))
-    pieces = [
-        np.concatenate([getattr(atlas, f"piece_{name}")[old], fresh])
-        for name, fresh in (
-            ("texel", atlas.piece_texel[home]),
-            ("area", area),
-            ("corners", small),
-            ("triangle", triangle[origin]),
-        )
-    ]
-    order = np.argsort(pieces[0], kind="stable")
-    reduced = restricted(atlas, scene, changed, (pieces[0][order], pieces[1][order], pieces[2][order], pieces[3][order]))
+    texel = np.concatenate([atlas.piece_texel[old], atlas.piece_texel[home]])
+    area = np.concatenate([atlas.piece_area[old], atlas.piece_area[home] * np.abs(np.linalg.det(cut))])
+    place = np.concatenate([atlas.piece_corners[old], small])
+    face = np.concatenate([atlas.piece_triangle[old], triangle[origin]])
+    order = np.argsort(texel, kind="stable")
+    reduced = restricted(atlas, scene, changed, (texel[order], area[order], place[order], face[order]))
     # A ray that meets what little is left of a texel finds its neighbours, as beside any chart.
     reduced.slot[reduced.slot == SHUT] = -1
     return reduced
@@ -229,7 +223,8 @@ def _solid_parts(
     is_open = holes.open_at(np.repeat(triangle, len(middle)), place[:, 1].copy(), place[:, 2].copy())
     solid = [~is_open.reshape(len(triangle), -1)]
     for _ in range(depth):
-        solid.insert(0, solid[0].reshape(len(triangle), -1, 4).all(2))
+        solid.append(solid[-1].reshape(len(triangle), -1, 4).all(2))
+    solid.reverse()
     parent, cut = [np.zeros(0, np.int64)], [np.zeros((0, 3, 3))]
     covered = solid[0]
     for level in range(1, depth + 1):
