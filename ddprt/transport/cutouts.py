@@ -221,9 +221,9 @@ def _solid_parts(
     middle = levels[-1].mean(1)
     place = np.einsum("mk,nkc->nmc", middle, weights).reshape(-1, 3)
     is_open = holes.open_at(np.repeat(triangle, len(middle)), place[:, 1].copy(), place[:, 2].copy())
-    solid = [~is_open.reshape(len(triangle), -1)]
+    solid = [np.asarray(~is_open).reshape(len(triangle), -1)]
     for _ in range(depth):
-        solid.append(solid[-1].reshape(len(triangle), -1, 4).all(2))
+        solid.append(np.asarray(solid[-1].reshape(len(triangle), -1, 4).all(2)))
     solid.reverse()
     parent, cut = [np.zeros(0, np.int64)], [np.zeros((0, 3, 3))]
     covered = solid[0]
