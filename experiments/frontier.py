@@ -24,11 +24,11 @@ from typing import Any
 import numpy as np
 
 import ddprt
-from ddprt.bench.peers import Sizes, measure, table
-from ddprt.bench.planner import Place, Trial
-from ddprt.bench.trial import Workshop
-from ddprt.bench.tune import BASES, Search
-from ddprt.bench.yardstick import make_yardstick
+from ddprt.bench.measure.trial import Workshop
+from ddprt.bench.measure.yardstick import make_yardstick
+from ddprt.bench.peers.peers import Sizes, measure, table
+from ddprt.bench.tune.planner import Place, Trial
+from ddprt.bench.tune.search import BASES, Search
 from ddprt.config import Config, checked
 from ddprt.pipeline import Run
 from ddprt.progress import Progress

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ddprt.bench.planner import KNOBS, QUANTITIES, Place, Plan, Planner, Trial
-from ddprt.bench.settings import Setting, changed
-from ddprt.bench.timing import timed
-from ddprt.bench.trial import Workshop, about, environment, why
+from ddprt.bench.measure.settings import Setting, changed
+from ddprt.bench.measure.timing import timed
+from ddprt.bench.measure.trial import Workshop, about, environment, why
+from ddprt.bench.tune.planner import KNOBS, QUANTITIES, Place, Plan, Planner, Trial
 from ddprt.config import Config
 from ddprt.dataset.forecast import forecast
 from ddprt.dataset.store import Dataset
