@@ -17,7 +17,7 @@ from ddprt.config import checked as configured
 from ddprt.dataset.store import open_dataset
 from ddprt.lights import parse_lighting
 from ddprt.sampling.points import place_samples
-from ddprt.scene.atlas import build_atlas
+from ddprt.scene.atlas import SHUT, build_atlas
 from ddprt.scene.checks import checked
 from ddprt.scene.holes import Holes
 from ddprt.scene.library import build
@@ -260,6 +260,7 @@ def test_texels_count_what_of_them_is_there() -> None:
     assert atlas.area[~upper].sum() == pytest.approx(1.0, rel=1e-9)
     assert (np.abs(atlas.position[upper, 1] - 0.5) < 0.25).all()
     np.testing.assert_allclose(atlas.coverage / atlas.area, atlas.texels_per_metre**2, rtol=1e-6)
+    assert (atlas.slot > SHUT).all()  # beside a leaf a hit finds it, as beside any chart
     # Whole texels keep every bit.
     kept = whole.slot.ravel()[atlas.texel]
     same = atlas.area == whole.area[kept]
