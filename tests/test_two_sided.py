@@ -147,3 +147,6 @@ def test_backs_keep_textures_and_shading_normals() -> None:
     front, back = scene.albedo_at(np.zeros(20, int), weights), scene.albedo_at(np.full(20, 2), solved)
     np.testing.assert_allclose(front, back, atol=1e-9)
     np.testing.assert_array_equal(scene.normals[scene.triangles[2]], -tilted[:3])
+    one = without_backs(scene)
+    np.testing.assert_array_equal(one.uv, square[:, :2])
+    np.testing.assert_array_equal(one.positions, square)
