@@ -92,7 +92,7 @@ def test_the_lightmap_is_learned_as_without_layers(data: Dataset, plain: Dataset
 
 
 def test_a_layer_is_learned_with_its_sign(data: Dataset) -> None:
-    """Answers are nearer than any without negative coefficients could be, and the law of the mean holds for them as they are."""
+    """Answers are nearer than any without negative coefficients could be, and beat the mean of them as they are."""
     model, test = ddprt.fit(data, bases=12), data.split("test")
     part = model.layers["probes"]
     truth = read_light(data, part.layer, test)
