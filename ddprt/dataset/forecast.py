@@ -185,7 +185,7 @@ def _placed(job: Sampled, samples: Samples, entries: list[tuple[str, Lighting]])
     store.write_description(job.folder, {**baked_settings(job.config, job.scene), "lightings": records})
     places = {"position": samples.position, "normal": samples.normal, "albedo": samples.albedo}
     write_tensors(job.folder / "points.safetensors", {**places, "spacing": np.zeros(1), "depth": np.zeros(1)})
-    write_tensors(job.folder / "scene.safetensors", {"corners": job.scene.corners, "uv": job.atlas.uv})
+    write_tensors(job.folder / "scene.safetensors", store.scene_tensors(job.scene, job.atlas))
     for name in ("points.safetensors", "scene.safetensors"):
         job.manifest.add(name)
     store.write_atlas(job.folder, job.atlas, job.manifest)
