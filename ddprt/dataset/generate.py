@@ -250,9 +250,7 @@ class _Bake:
         dataset = Dataset(self.folder, description, keep_alive)
         self._direct(dataset, manifest, atlas, samples)
         self._judge_lightings(dataset, fresh=there is None)
-        indirect = IndirectBake(self.config, self.scene, self.tracer, atlas, effects, dataset, manifest, self.progress)
-        indirect.run("train", dataset.split("train") + dataset.split("validation"))
-        indirect.run("test", dataset.split("test"))
+        IndirectBake(self.config, self.scene, self.tracer, atlas, effects, dataset, manifest, self.progress).all()
         self._end(description)
         return dataset
 

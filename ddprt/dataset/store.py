@@ -27,6 +27,8 @@ from ddprt.scene.exr import exposure_for, read_exr, write_exr
 
 SCHEMA = 1
 _GBUFFER = ("position", "normal", "geometric_normal", "albedo", "area", "coverage")
+CONSTANT = "constant.exr"
+"""Light of what glows in the scene, where a plan calls for it."""
 ATLAS_FILES = tuple(f"atlas/{name}.exr" for name in _GBUFFER)
 
 
@@ -132,6 +134,16 @@ class Dataset:
         return self._shelf.fill([map_name("indirect", i) for i in range(len(self.lightings))], self.covered, read)
 
     @cached_property
+    def constant(self) -> Float32[np.ndarray, "texels 3"] | None:
+        """Irradiance of emissive surfaces, W/m², in no other map of the dataset; None where none was baked."""
+        if not _glows(self.description):
+            return None
+        path = self.folder / CONSTANT
+        values = _light(*self._stored(path))[self.covered]
+        _refuse_odd(path, values)
+        return values
+
+    @cached_property
     def _shelf(self) -> Shelf:
         def sources() -> dict[str, dict[str, Any]]:
             names = ["atlas/coverage.exr", *(map_name("indirect", i) for i in range(len(self.lightings)))]
@@ -215,11 +227,15 @@ def read_description(folder: Path) -> dict[str, Any]:
 
 def expected_files(description: dict[str, Any]) -> list[str]:
     """Names of all files of a finished dataset."""
-    names = ["scene.safetensors", "points.safetensors", *ATLAS_FILES]
+    names = ["scene.safetensors", "points.safetensors", *ATLAS_FILES, *([CONSTANT] if _glows(description) else [])]
     for index, entry in enumerate(description["lightings"]):
         kinds = ["direct", "measured", "indirect", *(["noise"] if entry["split"] == "test" else [])]
         names += [map_name(kind, index) for kind in kinds]
     return names
+
+
+def _glows(description: dict[str, Any]) -> bool:
+    return any(entry["called"] for entry in description.get("plan", ()) if entry["name"] == "emission")
 
 
 class Manifest:

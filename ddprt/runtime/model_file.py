@@ -78,6 +78,8 @@ def save_model(model: Model, folder: Path) -> None:
     }
     if model.uv is not None:
         tensors["scene.uv"] = model.uv
+    if model.constant is not None:
+        tensors["light.constant"] = model.constant
     trust: dict[str, float] = {}
     if model.yardstick is not None:
         for entry in fields(model.yardstick):
@@ -180,6 +182,9 @@ def _assemble(document: dict[str, Any], checked: _Document, tensors: dict[str, n
     uv = tensors.get("scene.uv")
     if uv is not None and uv.shape != (len(tensors["scene.corners"]), 3, 2):
         raise ValueError(f"got lightmap coordinates of shape {uv.shape}")
+    constant = tensors.get("light.constant")
+    if constant is not None and constant.shape != (int(tensors["atlas.covered"].sum()), 3):
+        raise ValueError(f"got constant light of shape {constant.shape}")
     position, normal, albedo = (tensors[f"points.{name}"] for name in ("position", "normal", "albedo"))
     samples = Samples(position, normal, albedo, places.spacing, places.depth)
     return Model(
@@ -195,6 +200,7 @@ def _assemble(document: dict[str, Any], checked: _Document, tensors: dict[str, n
         document["scene"],
         uv,
         None if checked.trust is None else _yardstick(checked.trust, tensors),
+        constant,
     )
 
 

@@ -126,6 +126,7 @@ def fit_method(
         {key: data.description["scene"][key] for key in ("name", "digest")},
         data.uv,
         yardstick,
+        data.constant,
     )
 
 

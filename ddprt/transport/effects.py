@@ -191,9 +191,32 @@ def _material(has: Callable[[Material], object], lacking: str) -> Callable[[str,
     return decide
 
 
+def _emission(name: str, question: Question) -> Effect:
+    users, used = question.users(_brightest), question.scene.used_materials
+    if not users:
+        return Effect(name, False, "no material emits light")
+    brightest, albedo = max(map(_brightest, used)), max(max(material.albedo) for material in used)
+    bound = f"at most {np.pi * brightest / (1 - albedo):.3g}" if albedo < 1 else "any amount of"
+    return Effect(name, True, f"{users}, {bound} W/m² of irradiance")
+
+
+def _brightest(material: Material) -> float:
+    """Largest radiance that it emits."""
+    part = material.emission
+    return 0.0 if part is None else max(part.radiance) * (1.0 if part.texture is None else float(part.texture.max()))
+
+
+def _without_emission(scene: Scene) -> Scene:
+    return scene.made_of(lambda material: replace(material, emission=None))
+
+
 EFFECTS: Catalogue[Entry] = Catalogue(
     "effect",
-    {"diffuse bounces": Entry(_diffuse_bounces), **{f"{kind} lights": _light_kind(kind) for kind in LIGHTS}},
+    {
+        "diffuse bounces": Entry(_diffuse_bounces),
+        **{f"{kind} lights": _light_kind(kind) for kind in LIGHTS},
+        "emission": Entry(_emission, "emission", _without_emission),
+    },
 )
 
 
