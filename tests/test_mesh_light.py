@@ -23,8 +23,12 @@ SIGNIFICANT = 1e-4
 """Seeds are fixed, so a sound sampler passes always; one that is off by a percent in a bin fails by many decades."""
 SIGMAS = 4.0
 RECT: dict[str, Any] = {
-    "type": "rect", "center": [0.2, 0.45, 0.25], "half_u": [0.1, 0.0, 0.02], "half_v": [0.0, 0.03, 0.06], "radiance": [5.0, 4.0, 3.0],
-}  # fmt: skip
+    "type": "rect",
+    "center": [0.2, 0.45, 0.25],
+    "half_u": [0.1, 0.0, 0.02],
+    "half_v": [0.0, 0.03, 0.06],
+    "radiance": [5.0, 4.0, 3.0],
+}
 POWERS = np.array([1.0, 4.0, 0.0, 2.0, 0.5])
 
 
@@ -58,7 +62,7 @@ def test_a_tetrahedron_lights_as_the_faces_that_it_shows() -> None:
     faces = corners[[[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]]]
     lamp = light({"type": "mesh", "mesh": faces.tolist(), "position": [0.1, 1.0, 0.2], "radiance": [2, 2, 2]})
     point = np.array([0.3, 0.0, 0.4])
-    faces = faces + [0.1, 1.0, 0.2]
+    faces += np.array([0.1, 1.0, 0.2])
     across = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
     shown = np.einsum("td,td->t", across, point - faces[:, 0]) > 0
     assert 0 < shown.sum() < 4
@@ -70,7 +74,13 @@ def test_a_tetrahedron_lights_as_the_faces_that_it_shows() -> None:
 def test_a_ball_of_triangles_lights_as_a_ball() -> None:
     directions, triangles = icosphere(4)
     position, radius = [0.5, 2.0, -0.3], 0.6
-    record = {"type": "mesh", "mesh": directions[triangles].tolist(), "position": position, "scale": radius, "radiance": [3] * 3}
+    record = {
+        "type": "mesh",
+        "mesh": directions[triangles].tolist(),
+        "position": position,
+        "scale": radius,
+        "radiance": [3] * 3,
+    }
     squared = float(np.dot(position, position))
     expected = np.pi * 3 * radius**2 / squared * position[1] / np.sqrt(squared)
     mean, error = sampled(light(record), np.zeros(3), UP, 1 << 17)
@@ -163,7 +173,7 @@ def test_a_file_is_scaled_then_turned_then_moved(lamp_file: Path) -> None:
     twice = light({**lighting_json((lamp,))[0], "rotation": [0.0, 0.0, 2 * half, 2 * half]})
     np.testing.assert_allclose(twice.shape.corners, expected, atol=1e-15, err_msg="a quaternion of any length")
     centre = np.average(expected.mean(1), axis=0, weights=[1, 1, 1, np.sqrt(3)])
-    np.testing.assert_allclose(lamp.anchor(), [1, 2, 3] + centre, atol=1e-14)
+    np.testing.assert_allclose(lamp.anchor(), np.array([1, 2, 3]) + centre, atol=1e-14)
     assert lamp.reach() == pytest.approx(np.linalg.norm(expected - centre, axis=2).max())
 
 
@@ -177,18 +187,18 @@ def test_what_is_stored_names_the_file_and_what_was_in_it(lamp_file: Path) -> No
     again = light(stored)  # a dataset opens though its lamps are gone
     assert again == lamp
     points, u = np.zeros((1, 3)), np.full((1, 2), 0.5)
+    ddprt.lights.mesh._read.cache_clear()
     with pytest.raises(UserError, match="but the light was made of"):
-        ddprt.lights.mesh._read.cache_clear()
         again.illuminate(points, u)
     lamp_file.unlink()
-    with pytest.raises(UserError, match="got no file .*lamp.obj, expected the mesh of a light; check the path"):
+    with pytest.raises(UserError, match=r"got no file .*lamp\.obj, expected the mesh of a light; check the path"):
         light(stored).illuminate(points, u)
 
 
 def test_copies_keep_their_shape() -> None:
     lamp = light(as_mesh(RECT))
     moved = lamp.translated(np.array([1.0, 2.0, 3.0])).scaled(2.0)
-    np.testing.assert_allclose(moved.anchor(), np.array(RECT["center"]) + [1, 2, 3], atol=1e-15)
+    np.testing.assert_allclose(moved.anchor(), np.add(RECT["center"], [1, 2, 3]), atol=1e-15)
     assert moved.radiance == (10.0, 8.0, 6.0)
     assert parse_lighting(lighting_json((moved,))) == (moved,)
     assert moved != lamp
