@@ -28,7 +28,7 @@ from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import faceted, rectangle
 from ddprt.sections import TransportConfig
 from ddprt.transport.effects import force, plan
-from ddprt.transport.embree import Tracer
+from ddprt.transport.embree import Tracer, lifted
 from ddprt.transport.emission import Constant, Emitters, constant_light
 
 LAMP = {"type": "point", "position": [0.0, 2.0, 1.5], "intensity": [1.0, 1.0, 1.0]}
@@ -95,6 +95,14 @@ def test_a_glowing_plate_lights_another_by_its_form_factor() -> None:
     assert (mean > np.pi * COLOUR * (factor + 0.9 * 0.3 * 0.7 * factor**3)).all(), "and reflect it"
 
 
+def sampled(emitters: Emitters, tracer: Tracer, point: np.ndarray, count: int) -> np.ndarray:
+    """Samples of light on a floor at a point in world space."""
+    place = np.tile((point - emitters.scene.centre).astype(np.float32), (count, 1))
+    up = np.tile(np.array([0, 1, 0], np.float32), (count, 1))
+    u = np.random.default_rng(0).random((count, 4), np.float32)
+    return emitters.irradiance(tracer, lifted(tracer, place, up), up, u)
+
+
 def corner_scene(height: float = 0.5) -> Scene:
     """A floor, and a glowing wall that stands on it."""
     floor = rectangle((-1.0, -1.0), (1.0, 1.0), 0.0, 1, facing=1)
@@ -108,15 +116,12 @@ def test_points_beside_a_glowing_wall_meet_lamberts_formula(away: float) -> None
     """Where they touch, 1 / r² has no bound; a sample does."""
     scene, count = corner_scene(), 1 << 16
     tracer, emitters = Tracer.of(scene), Emitters.of(scene)
-    point, up = np.array([away, 0.0, 0.1]), np.array([0.0, 1.0, 0.0])
+    point = np.array([away, 0.0, 0.1])
     wall = scene.corners[emitters.triangle].reshape(-1, 3)
     low, high = wall.min(0), wall.max(0)
     outline = np.array([[0, low[1], low[2]], [0, high[1], low[2]], [0, high[1], high[2]], [0, low[1], high[2]]])
-    expected = polygon_irradiance(outline, 1.0, point, up) * COLOUR
-    place = np.tile((point - scene.centre).astype(np.float32), (count, 1))
-    floor = np.flatnonzero(scene.geometric_normals[:, 1] > 0.9)[0]
-    u = np.random.default_rng(0).random((count, 4), np.float32)
-    values = emitters.irradiance(tracer, place, np.full(count, floor), u)
+    expected = polygon_irradiance(outline, 1.0, point, np.array([0.0, 1.0, 0.0])) * COLOUR
+    values = sampled(emitters, tracer, point, count)
     error = values.std(0) / np.sqrt(count)
     # The ray's origin stands `offset` above the floor, which a thousandth of a metre away matters.
     assert (np.abs(values.mean(0) - expected) < SIGMAS * error + 2 * tracer.offset / away * expected).all()
@@ -164,9 +169,7 @@ def test_textured_light_is_the_integral_over_its_texture(holes: bool) -> None:
         spot = corners[:, 0] + inner[:, :1] * (corners[:, 1] - corners[:, 0]) + inner[:, 1:] * (corners[:, 2] - corners[:, 0])
         values = weights / (((spot - point) ** 2).sum(1) ** 2)[:, None]
     else:
-        place = np.tile((point - scene.centre).astype(np.float32), (count, 1))
-        u = np.random.default_rng(0).random((count, 4), np.float32)
-        values = emitters.irradiance(tracer, place, np.zeros(count, int), u)
+        values = sampled(emitters, tracer, point, count)
     error = values.std(0) / np.sqrt(count)
     # The midpoint rule errs by its step squared, and by a step along the rim of holes.
     assert (np.abs(values.mean(0) - expected) < SIGMAS * error + (1 / n if holes else 1 / n**2) * expected).all()
@@ -338,27 +341,15 @@ def test_scenes_that_do_not_glow_never_import_it(tmp_path: Path, monkeypatch: py
 # --- Mitsuba ----------------------------------------------------------------------------------------------------------
 
 TEXELS = 256
-SAMPLES = 4096
-RUNS = 12
+SAMPLES = 2048
+RUNS = 8
 
 
-@pytest.mark.slow
-def test_constant_light_agrees_with_mitsuba(neon: Scene) -> None:
-    """Emitters as meshes with `area` emitters: paths from places of the same texels, cosine-weighted, that see the light."""
-    mi = pytest.importorskip("mitsuba", reason='needs the extra "reference"')
-    mi.set_variant("scalar_rgb")
-    atlas, tracer = build_atlas(neon, 48), Tracer.of(neon, 2)
-    rng = np.random.default_rng(0)
-    texels = np.sort(rng.choice(atlas.count, TEXELS, replace=False))
-    runs = [
-        constant_light(neon, tracer, atlas, TransportConfig(test_samples=256), seed=seed, bounces=-1) for seed in range(RUNS)
-    ]
-    halves = np.array([run.irradiance + sign * run.noise for run in runs for sign in (1, -1)])[:, texels].astype(float)
-    ours, variance = halves.mean(0), halves.var(0, ddof=1) / len(halves)
-
+def mitsuba_scene(mi: Any, scene: Scene) -> Any:
+    """One mesh per material in the centred frame, flat and one-sided, with `area` emitters."""
     parts: dict[str, Any] = {"type": "scene"}
-    for index, material in enumerate(neon.materials):
-        corners = neon.corners[neon.material == index] - neon.centre
+    for index, material in enumerate(scene.materials):
+        corners = scene.corners[scene.material == index] - scene.centre
         properties = mi.Properties()
         properties["face_normals"] = True
         properties["bsdf"] = mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": list(material.albedo)}})
@@ -371,25 +362,68 @@ def test_constant_light_agrees_with_mitsuba(neon: Scene) -> None:
         parameters["faces"] = np.arange(3 * len(corners), dtype=np.uint32)
         parameters.update()
         parts[f"mesh{index}"] = mesh
-    scene = mi.load_dict(parts)
-    path = mi.load_dict({"type": "path", "max_depth": -1})
+    return mi.load_dict(parts)
+
+
+def mitsuba_samples(
+    mi: Any, scene: Any, places: np.ndarray, normals: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Direct light by its choice of emitters, and what its paths bring less what they see of emitters first; red."""
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(1)
-    theirs, their_variance = np.zeros((2, TEXELS))
+    sampler.seed(int(rng.integers(2**31)))
+    path = mi.load_dict({"type": "path", "max_depth": -1})
+    sphere = rng.normal(size=places.shape)
+    towards = normals + sphere / np.linalg.norm(sphere, axis=1, keepdims=True)
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    direct, indirect = np.zeros((2, len(places)))
+    for index, (origin, direction) in enumerate(zip((places + 1e-5 * normals).tolist(), towards.tolist(), strict=True)):
+        ray = mi.RayDifferential3f(origin, direction)
+        light = path.sample(scene, sampler, ray)[0][0]
+        first = scene.ray_intersect(ray)
+        emitter = first.emitter(scene)
+        indirect[index] = np.pi * (light - (emitter.eval(first)[0] if emitter is not None else 0))
+        reference = mi.SurfaceInteraction3f()
+        reference.p, reference.n, reference.t = mi.Point3f(origin), mi.Normal3f(normals[index].tolist()), 0.0
+        sample, weight = scene.sample_emitter_direction(reference, sampler.next_2d(), True)
+        direct[index] = max(float(np.dot(normals[index], [sample.d[0], sample.d[1], sample.d[2]])), 0.0) * weight[0]
+    return direct, indirect
+
+
+@pytest.mark.slow
+def test_constant_light_agrees_with_mitsuba(neon: Scene) -> None:
+    """Emitters as meshes with `area` emitters; paths begin at places of the same texels."""
+    mi = pytest.importorskip("mitsuba", reason='needs the extra "reference"')
+    mi.set_variant("scalar_rgb")
+    atlas, tracer = build_atlas(neon, 128), Tracer.of(neon, 2)
+    rng = np.random.default_rng(0)
+    texels = np.sort(rng.choice(atlas.count, TEXELS, replace=False))
+    scene = mitsuba_scene(mi, neon)
+    # Values are skewed: a low mean comes with a low variance, which would shift z. So the variance is of a second run.
+    theirs, variance = np.zeros((2, 2, TEXELS))
     for row, texel in enumerate(texels):
-        positions, triangle = atlas.sampler.sample(np.full(SAMPLES, texel), rng.random((SAMPLES, 2), np.float32))
-        normals = tracer.normals[triangle].astype(float)
-        sphere = rng.normal(size=(SAMPLES, 3))
-        direction = normals + sphere / np.linalg.norm(sphere, axis=1, keepdims=True)
-        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        origins = positions + 1e-5 * normals
-        values = np.pi * np.array([
-            path.sample(scene, sampler, mi.RayDifferential3f(origin, towards))[0][0]
-            for origin, towards in zip(origins.tolist(), direction.tolist(), strict=True)
-        ])  # fmt: skip
-        theirs[row], their_variance[row] = values.mean(), values.var() / SAMPLES
-    z = (ours[:, 0] - theirs) / np.sqrt(variance[:, 0] + their_variance)
-    print(f"neon: {TEXELS} texels, z {z.mean():+.3f} +- {z.std():.3f}, bias {ours[:, 0].mean() / theirs.mean() - 1:+.4f}")
-    # 256 scores: the mean is known to 0.063, the standard deviation to 0.045; four of these each.
-    assert abs(z.mean()) < 0.25
-    assert abs(z.std() - 1) < 0.18
+        for run in range(2):
+            places, triangle = atlas.sampler.sample(np.full(SAMPLES, texel), rng.random((SAMPLES, 2), np.float32))
+            parts = mitsuba_samples(mi, scene, places, tracer.normals[triangle].astype(float), rng)
+            for part, values in enumerate(parts):
+                if run == 0:
+                    theirs[part, row] = values.mean()
+                else:
+                    variance[part, row] = values.var() / SAMPLES
+    theirs[1] += theirs[0]
+    variance[1] += variance[0]
+    for part, bounces in enumerate((0, -1)):
+        runs = [
+            constant_light(neon, tracer, atlas, TransportConfig(test_samples=256), seed=seed, bounces=bounces)
+            for seed in range(RUNS)
+        ]
+        halves = np.array([run.irradiance + sign * run.noise for run in runs for sign in (1, -1)])[:, texels, 0].astype(float)
+        lit = np.flatnonzero(variance[part] > 0)
+        ours, own = halves.mean(0)[lit], halves.var(0, ddof=1)[lit] / len(halves)
+        z = (ours - theirs[part][lit]) / np.sqrt(own + variance[part][lit])
+        bias = ours.mean() / theirs[part][lit].mean() - 1
+        print(f"neon, bounces {bounces}: {len(z)} texels, z {z.mean():+.3f} +- {z.std():.3f}, means differ by {bias:+.4f}")
+        # 256 scores: the mean is known to 0.063, the standard deviation to 0.045; four of these each. Tails are heavy, since
+        # r² in the choice of emitters has no bound.
+        assert len(z) > 0.9 * TEXELS
+        assert abs(z.mean()) < 0.25
+        assert abs(z.std() - 1) < 0.2

@@ -3,7 +3,7 @@
 Its direct part is looked for from both sides, since neither does alone. A point of the emitters, chosen by their power, finds
 small and far ones; a ray of the hemisphere finds those that a surface touches, where 1 / r² has no bound. Their densities
 weigh them (balance heuristic), so no sample is worth more than pi times the radiance. What bounces is the operator's, from
-senders as small as texels: for a single lighting that costs little, and leaves nothing to look at more closely.
+senders as small as texels, which for a single lighting costs little.
 
 Reference: Veach and Guibas, "Optimally Combining Sampling Techniques for Monte Carlo Rendering", SIGGRAPH 1995.
 """
@@ -15,11 +15,13 @@ import numpy as np
 
 from ddprt import seeds, warp
 from ddprt.axes import Float, Float32, Float64, Int
+from ddprt.lights import Lighting
 from ddprt.lights.mesh import cumulated, pdf_triangles, sample_triangles
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.material import bilinear
 from ddprt.scene.mesh import Scene
 from ddprt.sections import TransportConfig
+from ddprt.transport.direct import Places
 from ddprt.transport.embree import Tracer, lifted
 
 _FEW, _MOST = 16, 4096  # samples of each texel and half that tell the noise, and that are taken unasked
@@ -95,24 +97,30 @@ class Emitters:
     def irradiance(
         self,
         tracer: Tracer,
-        positions: Float32[np.ndarray, "n 3"],
-        triangle: Int[np.ndarray, " n"],
+        origins: Float32[np.ndarray, "n 3"],
+        normals: Float32[np.ndarray, "n 3"],
         u: Float32[np.ndarray, "n 4"],
     ) -> Float64[np.ndarray, "n 3"]:
         """One sample of their direct irradiance from either side, W/m²; its mean over `u` is exact.
 
         Args:
           tracer: the occluders, which the emitters are among.
-          positions: on the surface, centred frame, metres.
-          triangle: of the scene, that each lies on; only its front receives.
+          origins: of rays, off the surface (see `lifted`), centred frame, metres.
+          normals: unit, geometric.
           u: uniform numbers.
         """
-        normals = tracer.normals[triangle]
-        origins = np.ascontiguousarray(lifted(tracer, positions, normals))
         light = np.zeros((len(origins), 3))
         self._chosen_points(tracer, origins, normals, u[:, :2], light)
-        self._chosen_directions(tracer, origins, triangle, u[:, 2:], light)
+        self._chosen_directions(tracer, origins, normals, u[:, 2:], light)
         return light
+
+    def shine(
+        self, tracer: Tracer, lighting: Lighting, places: Places, rng: np.random.Generator
+    ) -> Float32[np.ndarray, "places 3"]:
+        """The same at places of one sample each, as `mean_irradiance` gives that of lights; `lighting` is nothing to it."""
+        rows = places.blocks.swapaxes(1, 2).reshape(-1, 6)[: places.count]
+        origins, normals = np.ascontiguousarray(rows[:, :3]), np.ascontiguousarray(rows[:, 3:])
+        return self.irradiance(tracer, origins, normals, rng.random((len(rows), 4), np.float32)).astype(np.float32)
 
     def _chosen_points(
         self, tracer: Tracer, origins: np.ndarray, normals: np.ndarray, u: np.ndarray, light: Float64[np.ndarray, "n 3"]
@@ -135,18 +143,17 @@ class Emitters:
         light[seen] += weight[:, None] * self.radiance(triangle[seen], weights[seen].astype(np.float64))
 
     def _chosen_directions(
-        self, tracer: Tracer, origins: np.ndarray, triangle: np.ndarray, u: np.ndarray, light: Float64[np.ndarray, "n 3"]
+        self, tracer: Tracer, origins: np.ndarray, normals: np.ndarray, u: np.ndarray, light: Float64[np.ndarray, "n 3"]
     ) -> None:
         """Adds what comes along cosine-weighted directions, one for each origin."""
-        directions = np.ascontiguousarray(warp.to_world(warp.sample_cosine(u), tracer.frames[triangle]), np.float32)
+        directions = warp.to_world(warp.sample_cosine(u), warp.frame(normals))
         hits = tracer.closest(origins, directions)
         met = np.flatnonzero(hits.front & (self.density[hits.triangle] > 0))
         there = hits.triangle[met]
         weights = np.stack([hits.u[met], hits.v[met]], 1).astype(np.float64)
         a, b, c = np.moveaxis(self.scene.corners[there] - self.scene.centre, 1, 0)
         point = a + weights[:, :1] * (b - a) + weights[:, 1:] * (c - a)
-        normals = tracer.normals[triangle[met]]
-        squared, cosine, their_cosine = _facing(origins[met], normals, point, self.scene.geometric_normals[there])
+        squared, cosine, their_cosine = _facing(origins[met], normals[met], point, self.scene.geometric_normals[there])
         weight = _balanced(cosine, their_cosine, squared, self.density[there])
         light[met] += weight[:, None] * self.radiance(there, weights)
 
@@ -193,7 +200,7 @@ def constant_light(
     facts: dict[str, Any] = {"emitters": len(emitters.triangle), "direct_samples": 2 * samples}
     halves = direct
     if bounces != 0:
-        indirect, rays = _indirect(tracer, atlas, direct, config, seed, bounces)
+        indirect, rays = _indirect(emitters, tracer, atlas, direct, config, seed, bounces)
         facts["samples"] = rays
         halves = [one + other for one, other in zip(direct, indirect, strict=True)]
     relative = _relative(halves, atlas)
@@ -215,13 +222,15 @@ def _direct(
         u = (shift + sequence).reshape(-1, 6)
         u -= u >= 1
         positions, triangle = atlas.sampler.sample(np.repeat(texels, samples), u[:, :2])
-        light = emitters.irradiance(tracer, positions, triangle, u[:, 2:])
+        normals = tracer.normals[triangle]
+        light = emitters.irradiance(tracer, lifted(tracer, positions, normals), normals, u[:, 2:])
         return light.reshape(len(texels), samples, 3).mean(1).astype(np.float32)
 
     return np.concatenate(list(tracer.map(work, range(0, atlas.count, block))))
 
 
 def _indirect(
+    emitters: Emitters,
     tracer: Tracer,
     atlas: Atlas,
     direct: list[Float32[np.ndarray, "texels 3"]],
@@ -236,12 +245,14 @@ def _indirect(
     operator = Operator.of(tracer, atlas, atlas.resolution)
     found, rays = [], np.zeros(0, np.int64)
     for half, light in enumerate(direct):
-        stream = f"emission {half}"
-        radiosity = operator.bounce(operator.averaged(light), seed=seed, stream=stream, bounces=bounces).radiosity
+        address: dict[str, Any] = {"seed": seed, "stream": f"emission {half}"}
+        averaged = operator.averaged(light)
+        radiosity = operator.bounce(averaged, **address, bounces=bounces).radiosity
+        near = replace(operator.near([()], averaged, bounces=bounces), shine=emitters.shine)
         if half == 0:
-            rays = choose_rays(operator, radiosity, config, held_out=True, seed=seed, stream=stream).rays
+            rays = choose_rays(operator, radiosity, config, near=near, held_out=True, **address).rays
         out = np.zeros((1, atlas.count, 3), np.float32)
-        for _ in operator.gather(radiosity, out, rays, seed=seed, stream=stream):
+        for _ in operator.gather(radiosity, out, rays, near=near, **address):
             pass
         found.append(out[0])
     return found, float(2 * np.mean(rays))
