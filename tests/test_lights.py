@@ -38,6 +38,12 @@ RECORDS: dict[str, dict[str, Any]] = {
         "radiance": [1.0, 2.0, 0.5],
     },
     "sphere": {"type": "sphere", "center": [0.3, 1.2, -0.4], "radius": 0.2, "radiance": [1.0, 2.0, 0.5]},
+    "mesh": {
+        "type": "mesh",
+        "mesh": [[[-0.25, 0.0, -0.25], [0.25, 0.0, -0.25], [0.0, 0.0, 0.5]]],
+        "position": [0.3, 1.2, -0.4],
+        "radiance": [1.0, 2.0, 0.5],
+    },
 }
 UP = np.array([0.0, 1.0, 0.0])
 
@@ -332,7 +338,7 @@ def without(kind: str, key: str) -> dict[str, Any]:
 BAD: list[tuple[Any, str]] = [
     ({**RECORDS["point"], "type": "pont"}, r'\[0\]\.type: got .pont., expected one of .*did you mean "point"'),
     ({**RECORDS["point"], "type": ["point"]}, r"\[0\]\.type: got \[.point.\], expected one of"),
-    (without("point", "type"), r"\[0\]\.type: got None, expected one of directional, point, rect, sphere, spot"),
+    (without("point", "type"), r"\[0\]\.type: got None, expected one of directional, mesh, point, rect, sphere, spot"),
     (without("point", "intensity"), r"lighting\[0\]\.intensity: got none, expected it among type, position, intensity; add it"),
     (without("rect", "half_v"), r"\[0\]\.half_v: got none, expected it among type, center, half_u, half_v, radiance; add it"),
     ({**RECORDS["point"], "colour": [1, 1, 1]}, r"\[0\]\.colour: unknown key; known here: type, position, intensity"),

@@ -32,9 +32,10 @@ from ddprt.dataset import store
 from ddprt.dataset.denoise import find_denoiser
 from ddprt.dataset.forecast_indirect import expect_indirect
 from ddprt.dataset.generate import baked_settings, check_points, sunk
+from ddprt.dataset.manifest import Manifest, map_name
 from ddprt.dataset.sampled import Expected, Part, Sampled
 from ddprt.dataset.splits import choose_lightings, doubt
-from ddprt.dataset.store import ATLAS_FILES, Manifest, map_name
+from ddprt.dataset.store import ATLAS_FILES
 from ddprt.files import write_tensors
 from ddprt.lights import Lighting, lighting_json
 from ddprt.machine import peak_memory_gib

@@ -15,18 +15,22 @@ from ddprt.errors import UserError, explain, nearest, spoken
 from ddprt.lights.area import RectLight, SphereLight
 from ddprt.lights.distant import DirectionalLight
 from ddprt.lights.light import Light
+from ddprt.lights.mesh import MeshLight
 from ddprt.lights.point import PointLight, SpotLight
 
 LIGHTS: Catalogue[type] = Catalogue(
     "light type",
-    {light.kind: light for light in (PointLight, SpotLight, DirectionalLight, RectLight, SphereLight)},
+    {light.kind: light for light in (PointLight, SpotLight, DirectionalLight, RectLight, SphereLight, MeshLight)},
 )
 Lighting = tuple[Light, ...]
 """Lights that are on together."""
 
 _EXAMPLE = '[{"type": "point", "position": [0, 1, 0], "intensity": [1, 1, 1]}]'
 _ADAPTER: TypeAdapter[Any] = TypeAdapter(
-    tuple[Annotated[PointLight | SpotLight | DirectionalLight | RectLight | SphereLight, Field(discriminator="type")], ...]
+    tuple[
+        Annotated[PointLight | SpotLight | DirectionalLight | RectLight | SphereLight | MeshLight, Field(discriminator="type")],
+        ...,
+    ]
 )
 
 
@@ -106,6 +110,7 @@ __all__ = [
     "DirectionalLight",
     "Light",
     "Lighting",
+    "MeshLight",
     "PointLight",
     "RectLight",
     "SphereLight",

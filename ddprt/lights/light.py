@@ -13,8 +13,9 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from ddprt.axes import Float, Float64
 
 _LARGEST = 1e30  # W/sr and the like: its square still has room in the exponent of the sums that follow
-_FARTHEST = 1e12  # metres: its square still fits into float32
-Coordinate = Annotated[float, Field(ge=-_FARTHEST, le=_FARTHEST)]
+FARTHEST = 1e12
+"""Metres: its square still fits into float32."""
+Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
 Strength = Annotated[float, Field(ge=0, le=_LARGEST)]
 Vector = tuple[Coordinate, Coordinate, Coordinate]
 Colour = tuple[Strength, Strength, Strength]
@@ -29,7 +30,7 @@ def _not_zero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
 def _normalised(vector: tuple[float, float, float]) -> tuple[float, float, float]:
     """Unit length, in float64 and safe at any size; a unit vector stays as it is, so that reading back changes nothing."""
     relative = np.array(_not_zero(vector)) / max(map(abs, vector))
-    length = float(np.linalg.norm(np.array(vector))) if max(map(abs, vector)) < _FARTHEST else np.inf
+    length = float(np.linalg.norm(np.array(vector))) if max(map(abs, vector)) < FARTHEST else np.inf
     if abs(length - 1) < 1e-12:
         return vector
     x, y, z = (relative / np.linalg.norm(relative)).tolist()

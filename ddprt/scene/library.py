@@ -10,7 +10,7 @@ from ddprt.catalogue import Catalogue
 from ddprt.errors import UserError, nearest
 from ddprt.scene.checks import checked, vertex_normals
 from ddprt.scene.cornell import cornell, cornell_hole
-from ddprt.scene.material import Cutout, Material
+from ddprt.scene.material import Cutout, Emission, Material
 from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import box, faceted, hollow, icosphere, rectangle
 
@@ -152,6 +152,39 @@ def faults(*, albedo: float = 0.7, thickness: float = 0.003, gap: float = 0.004)
     return faceted("faults", np.concatenate(quads), (Material("grey", (albedo,) * 3),))
 
 
+def neon(*, radiance: float = 40.0, albedo: float = 0.7) -> Scene:
+    """A small room with a glowing sign: LIT in bars before the back wall, two letters pink and one blue, and a table.
+
+    The sign lights the room whatever lamps there are besides, from surfaces that are narrow and near a wall.
+
+    Args:
+      radiance: of the brighter letters' strongest channel, W/(m² sr).
+      albedo: of walls, floor and ceiling.
+    """
+    room = hollow(np.ones((1, 1, 1), bool), np.array([-1.5, 1.5]), np.array([0.0, 2.4]), np.array([0.0, 3.0]))
+    bars = [
+        (-0.65, 1.2, -0.6, 1.9),
+        (-0.59, 1.2, -0.3, 1.25),
+        (-0.05, 1.2, 0.0, 1.9),
+        (0.3, 1.85, 0.7, 1.9),
+        (0.475, 1.2, 0.525, 1.84),
+    ]
+    sign = [box(np.array([left, low, 0.05]), np.array([right, high, 0.1])) for left, low, right, high in bars]
+    table = box(np.array([-0.7, 0.68, 1.1]), np.array([0.7, 0.75, 1.8]))
+    paint = np.repeat([0, 1, 2, 1, 3], [6, 12, 6, 12, 6])
+    glass, grey = (0.1,) * 3, (albedo,) * 3
+    tubes = [
+        Material(f"{name} tube", glass, emission=Emission((radiance * red, radiance * green, radiance * blue)))
+        for name, (red, green, blue) in (("pink", (1.0, 0.12, 0.35)), ("blue", (0.08, 0.4, 0.9)))
+    ]
+    return faceted(
+        "neon",
+        np.concatenate([room, *sign, table]),
+        (Material("plaster", grey), *tubes, Material("wood", (0.5, 0.3, 0.15))),
+        paint,
+    )
+
+
 def _turned(centre: tuple[float, float, float], size: tuple[float, float, float], degrees: float) -> np.ndarray:
     """A closed box seen from outside, turned about the vertical."""
     half, angle = np.array(size) / 2, math.radians(degrees)
@@ -222,6 +255,7 @@ SCENES: Catalogue[Callable[..., Scene]] = Catalogue(
         "convex": convex,
         "faults": faults,
         "leaves": leaves,
+        "neon": neon,
     },
 )
 

@@ -204,6 +204,25 @@ def _two_sided(name: str, question: Question) -> Effect:
     return Effect(name, count > 0, why)
 
 
+def _emission(name: str, question: Question) -> Effect:
+    users, used = question.users(_brightest), question.scene.used_materials
+    if not users:
+        return Effect(name, False, "no material emits light")
+    brightest, albedo = max(map(_brightest, used)), max(max(material.albedo) for material in used)
+    bound = f"at most {np.pi * brightest / (1 - albedo):.3g}" if albedo < 1 else "any amount of"
+    return Effect(name, True, f"{users}, {bound} W/m² of irradiance")
+
+
+def _brightest(material: Material) -> float:
+    """Largest radiance that it emits."""
+    part = material.emission
+    return 0.0 if part is None else max(part.radiance) * (1.0 if part.texture is None else float(part.texture.max()))
+
+
+def _without_emission(scene: Scene) -> Scene:
+    return scene.made_of(lambda material: replace(material, emission=None))
+
+
 EFFECTS: Catalogue[Entry] = Catalogue(
     "effect",
     {
@@ -211,6 +230,7 @@ EFFECTS: Catalogue[Entry] = Catalogue(
         **{f"{kind} lights": _light_kind(kind) for kind in LIGHTS},
         "cut-outs": Entry(_material(pierced, "no material has holes"), "cutouts", _without_cutouts),
         "two-sided sheets": Entry(_two_sided, without=without_backs),
+        "emission": Entry(_emission, "emission", _without_emission),
     },
 )
 
