@@ -7,6 +7,7 @@ reach, then their shadow rays, then what is left of its light. All but the shado
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 
 import numpy as np
 
@@ -189,12 +190,16 @@ def _add(
     for index, block in enumerate(places.blocks):
         if not light.delta:
             numbers(index * size, u)
-        sample = light.illuminate(block[:3].T, u.T, sample)
+        sample = light.illuminate(block[:3].T, u.T, sample, block[3:].T)
         light_there = sample.direction.T, sample.distance, sample.strength
         rays = _aim(block, *light_there, tracer.offset, weight, target, origins, directions, reach)
         if rays and any(sample.colour):
             seen = tracer.unoccluded(origins[:rays], directions[:rays], reach[:rays]) if shadows else np.ones(rays, np.int32)
-            _collect(seen, target, weight, sample.colour / samples, samples, index * size // samples, total)
+            arriving = seen, target, weight, sample.colour / samples, samples, index * size // samples, total
+            if sample.tint is None:
+                _collect(*arriving)
+            else:
+                import_module("ddprt.transport.tinted").into_groups(sample.tint.T, *arriving)
 
 
 def _given(numbers: Float32[np.ndarray, "n 2"], first: int, u: Float32[np.ndarray, "2 points"]) -> None:
