@@ -157,7 +157,7 @@ def _unpacked(data: np.ndarray, packed: np.ndarray) -> bool:
     for row in range(height):
         if at + 4 > len(data):
             return False
-        lines = data[at] == 2 and data[at + 1] == 2 and 256 * np.int64(data[at + 2]) + data[at + 3] == width
+        lines = data[at] == 2 and data[at + 1] == 2 and 256 * int(data[at + 2]) + int(data[at + 3]) == width
         if not lines or width < 8:
             if data[at] == 1 and data[at + 1] == 1 and data[at + 2] == 1:  # runs of whole pixels, of before 1991
                 return False
@@ -174,9 +174,8 @@ def _unpacked(data: np.ndarray, packed: np.ndarray) -> bool:
             while column < width:
                 if at + 1 >= len(data):
                     return False
-                count = np.int64(data[at])
-                run = count > 128
-                count -= 128 * run
+                run = data[at] > 128
+                count = int(data[at]) - (128 if run else 0)
                 if count == 0 or column + count > width or (not run and at + count >= len(data)):
                     return False
                 for step in range(count):

@@ -76,7 +76,7 @@ class Sky:
         return cls(radiance, heights, rows[0], along, *guides, mean, bright, min(bright / total, 1 - 1e-9))
 
     @property
-    def tables(self) -> tuple[np.ndarray, ...]:
+    def tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """What drawing a pixel takes."""
         return self.heights, self.rows, self.along, self.row_guide, self.along_guide
 
