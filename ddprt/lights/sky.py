@@ -7,9 +7,10 @@ with: the two match exactly. Two techniques are mixed, and their densities added
 - the *bright part*, radiance above the sky's mean: pixels by luminance above the mean times solid angle;
 - cosine-weighted directions about the normal for the rest, or uniform ones where no normal is known.
 
-The bright part is drawn as often as its share of all light. So a sky of one brightness is sampled as the cosine alone would,
-and of a sky with a sun the rays at the sun are spent on nothing else. Taking the mean off is MIS compensation (Karlik,
-Sik, Vevoda, Skrivan and Krivanek, "MIS Compensation", SIGGRAPH Asia 2019); docs/effects.md says what it gains.
+Half of the samples are drawn from each: groups of any even number then divide evenly, and on that noise hangs where all samples
+are spread evenly. A sky that is nowhere four times as bright as its mean is left to the cosine. Taking the mean off is MIS
+compensation (Karlik, Sik, Vevoda, Skrivan and Krivanek, "MIS Compensation", SIGGRAPH Asia 2019). docs/effects.md says what each
+of these gains.
 """
 
 from dataclasses import dataclass
@@ -29,6 +30,7 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _KEPT = 8  # skies held in memory: 24 bytes per pixel
 _ONE_AT_A_TIME = Lock()
 _BELOW_ONE = 1 - 2**-53
+_PEAKED = 4.0  # times the mean: below that, the cosine alone is never far off
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +45,7 @@ class Sky:
       row_guide, along_guide: the first row (pixel) that a number of a given stretch of [0, 1) can choose.
       mean: luminance that is taken off; the bright part is what exceeds it.
       bright: integral of the bright part over all directions, W/m².
-      share: of the bright part in all light, in [0, 1).
+      share: of samples that are drawn from the bright part.
     """
 
     radiance: Float32[np.ndarray, "height width 3"]
@@ -73,7 +75,8 @@ class Sky:
         along = _cumulative(flux)
         rows = _cumulative(flux.sum(1)[None])
         guides = _guide(rows)[0], _guide(along)
-        return cls(radiance, heights, rows[0], along, *guides, mean, bright, min(bright / total, 1 - 1e-9))
+        peaked = bool(luminance.max() > _PEAKED * mean)
+        return cls(radiance, heights, rows[0], along, *guides, mean, bright, 0.5 if peaked else 0.0)
 
     @property
     def tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

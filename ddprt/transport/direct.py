@@ -143,7 +143,9 @@ def mean_irradiance(
     total = np.zeros((places.count, 3), np.float32)
     for light in lighting:
         words = rng.integers(0, 1 << 64, 0 if light.delta else places.count, np.uint64).view(np.uint32).reshape(-1, 2)
-        _add(tracer, light, places, partial(_shifted, words, _sequence(places.samples)), total, shadows)
+        around = light.anchor() is None and not light.delta
+        sequence = (_lattice if around else _sequence)(places.samples)
+        _add(tracer, light, places, partial(_shifted, words, sequence), total, shadows)
     return total
 
 
@@ -213,6 +215,15 @@ def _sequence(samples: int) -> Float32[np.ndarray, "2 samples"]:
     """
     rho = 1.32471795724474602596
     return np.minimum(np.arange(samples) / np.array([[rho], [rho**2]]) % 1, 1 - 2**-24).astype(np.float32)
+
+
+def _lattice(samples: int) -> Float32[np.ndarray, "2 samples"]:
+    """The same for light from all around, of which every sample counts: even steps, and turns by the golden ratio.
+
+    Even steps put as many samples of each group below a half as above it, where a sky divides its techniques.
+    """
+    steps = np.arange(samples)
+    return np.stack([steps / samples, np.minimum(steps * 0.61803398874989485 % 1, 1 - 2**-24)]).astype(np.float32)
 
 
 @compiled
