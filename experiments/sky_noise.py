@@ -33,7 +33,7 @@ from ddprt.scene.mesh import Scene
 from ddprt.transport.direct import Texels
 from ddprt.transport.embree import Tracer
 
-SAMPLES = (4, 16, 64, 256)
+SAMPLES = (4, 16, 64)
 TURNS = (0.0, 70.0, 140.0, 210.0)
 REPEATS = 3
 """Of which the quickest counts."""

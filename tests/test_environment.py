@@ -1,5 +1,6 @@
 """Skies: closed forms, samplers against their densities, the sense of turning, images that are refused, and what they cost."""
 
+import json
 import os
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from oracles import chi_square, polygon_irradiance
 
 import ddprt
 from ddprt import seeds
+from ddprt.cli import main
 from ddprt.config import load_config
 from ddprt.dataset.splits import doubt
 from ddprt.errors import UserError
@@ -512,3 +514,33 @@ def test_a_sky_is_doubtful_only_without_light(statue: tuple[Scene, Tracer, Atlas
     scene, tracer, _ = statue
     assert doubt((sky(),), False, scene, tracer) == ""
     assert doubt((sky(scale=0),), True, scene, tracer) == "lights nothing: it has no intensity"
+
+
+@pytest.mark.slow
+def test_the_whole_chain_under_skies(tmp_path: Path) -> None:
+    """`ddprt run configs/smoke.toml` with skies on the statue: bakes by the operator, judged by the reference."""
+    file = Path(__file__).parent.parent / "configs" / "smoke.toml"
+    changes = {"scene.name": "statue", "lightings.kinds": '["environment"]', "atlas.resolution": "48"}
+    with pytest.raises(SystemExit) as ended:
+        main(
+            [
+                "run",
+                str(file),
+                "--out",
+                str(tmp_path),
+                *(word for key, value in changes.items() for word in (f"--{key}", value)),
+            ]
+        )
+    assert ended.value.code == 0
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    check = metrics["spot_check"]
+    # Scores of bake against reference, both noises counted; its noise per texel is five times the operator's bias.
+    assert abs(check["mean"]) < SIGMAS / np.sqrt(check["count"])
+    assert 0.6 < check["std"] < 1.4
+    assert metrics["methods"]["svd-ridge"]["relative_rmse"] < 0.7 * metrics["methods"]["mean"]["relative_rmse"]
+    described = json.loads((tmp_path / "dataset" / "dataset.json").read_text())
+    assert {effect["name"] for effect in described["plan"] if effect["called"]} == {"diffuse bounces", "environment lights"}
+    model = ddprt.load_model(tmp_path / "model.ddprt")
+    lit, twice = (model.relight({"type": "environment", "image": "sun-sky", "scale": scale}) for scale in (1.0, 2.0))
+    assert lit.any()
+    np.testing.assert_allclose(twice, 2 * lit, rtol=1e-4, atol=1e-5 * lit.max())

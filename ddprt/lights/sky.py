@@ -30,6 +30,7 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _KEPT = 8  # skies held in memory: 24 bytes per pixel
 _ONE_AT_A_TIME = Lock()
 _BELOW_ONE = 1 - 2**-53
+_FINER = 4  # stretches of height for each row: rows near the poles are thin
 _PEAKED = 4.0  # times the mean: below that, the cosine alone is never far off
 
 
@@ -43,6 +44,7 @@ class Sky:
       rows: cumulative chances of the rows, 0 to 1.
       along: cumulative chances of the pixels within each row, 0 to 1.
       row_guide, along_guide: the first row (pixel) that a number of a given stretch of [0, 1) can choose.
+      height_guide: the first row that a height y of a given stretch, from 1 down to -1, can lie in.
       mean: luminance that is taken off; the bright part is what exceeds it.
       bright: integral of the bright part over all directions, W/m².
       share: of samples that are drawn from the bright part.
@@ -54,6 +56,7 @@ class Sky:
     along: Float64[np.ndarray, "height pixel_edges"]
     row_guide: Int32[np.ndarray, " height"]
     along_guide: Int32[np.ndarray, "height width"]
+    height_guide: Int32[np.ndarray, " stretches"]
     mean: float
     bright: float
     share: float
@@ -74,7 +77,9 @@ class Sky:
         bright = float(flux.sum())
         along = _cumulative(flux)
         rows = _cumulative(flux.sum(1)[None])
-        guides = _guide(rows)[0], _guide(along)
+        stretches = 1 - 2 * np.arange(_FINER * height) / (_FINER * height)
+        to_height = np.searchsorted(-heights[1:-1], -stretches, side="right").astype(np.int32)
+        guides = _guide(rows)[0], _guide(along), to_height
         peaked = bool(luminance.max() > _PEAKED * mean)
         return cls(radiance, heights, rows[0], along, *guides, mean, bright, 0.5 if peaked else 0.0)
 
@@ -134,7 +139,8 @@ def shine(sky: Sky, turn: float, u: np.ndarray, normals: np.ndarray | None, out:
     facing = np.empty((3, 0), u.dtype) if normals is None else columns(normals)
     share, mean, bright = sky.share, sky.mean, sky.bright
     assert out.tint is not None
-    _shine(columns(u), facing, turn, share, mean, bright, sky.radiance, *sky.tables, out.direction.T, out.strength, out.tint.T)
+    there = out.direction.T, out.strength, out.tint.T
+    _shine(columns(u), facing, turn / (2 * np.pi), share, mean, bright, sky.radiance, sky.height_guide, *sky.tables, *there)
 
 
 def _cumulative(weights: Float64[np.ndarray, "lists n"]) -> Float64[np.ndarray, "lists edges"]:
@@ -197,6 +203,42 @@ def _draw(
 
 
 @compiled
+def _spun(turns: float) -> tuple[float, float]:
+    """Cosine and sine of any number of turns, good to the last bits; the polynomials of `area`, which must stay in its file."""
+    quarters = np.floor(4.0 * turns + 0.5)
+    x = (turns - 0.25 * quarters) * 2 * np.pi
+    xx = x * x
+    sine = -2.50507602534068634195e-08 + xx * 1.58969099521155010221e-10
+    sine = 8.33333333332248946124e-03 + xx * (-1.98412698298579493134e-04 + xx * (2.75573137070700676789e-06 + xx * sine))
+    sine = x + x * xx * (-1.66666666666666324348e-01 + xx * sine)
+    cosine = -2.75573143513906633035e-07 + xx * (2.08757232129817482790e-09 - xx * 1.13596475577881948265e-11)
+    cosine = 4.16666666666666019037e-02 + xx * (-1.38888888888741095749e-03 + xx * (2.48015872894767294178e-05 + xx * cosine))
+    cosine = 1 - 0.5 * xx + xx * xx * cosine
+    quarter = int(quarters) & 3
+    first, second = (-sine, cosine) if quarter & 1 else (cosine, sine)
+    flip = -1.0 if quarter & 2 else 1.0
+    return first * flip, second * flip
+
+
+@compiled
+def _turns_of(x: float, z: float) -> float:
+    """atan2(x, z) in turns, to 5e-10: nine terms of the series of the arctangent, at most tan(1/16 turn)^19 / 19 off."""
+    across, along = abs(x), abs(z)
+    low, high = min(across, along), max(across, along)
+    if high == 0:
+        return 0.0
+    steep = low > 0.41421356237309503 * high
+    q = (low - high) / (low + high) if steep else low / high
+    qq = q * q
+    series = 1 / 9 - qq * (1 / 11 - qq * (1 / 13 - qq * (1 / 15 - qq / 17)))
+    turns = q * (1 - qq * (1 / 3 - qq * (1 / 5 - qq * (1 / 7 - qq * series)))) / (2 * np.pi)
+    turns += 0.125 if steep else 0.0
+    turns = 0.25 - turns if across > along else turns
+    turns = 0.5 - turns if z < 0 else turns
+    return -turns if x < 0 else turns
+
+
+@compiled
 def _sample(
     u: np.ndarray,
     heights: np.ndarray,
@@ -208,8 +250,8 @@ def _sample(
 ) -> None:
     for i in range(u.shape[1]):
         _, _, y, turns = _draw(np.float64(u[0, i]), np.float64(u[1, i]), heights, rows, along, row_guide, along_guide)
-        flat, angle = np.sqrt(max(1 - y * y, 0.0)), 2 * np.pi * turns
-        found[0, i], found[1, i], found[2, i] = flat * np.sin(angle), y, -flat * np.cos(angle)
+        flat, (cosine, sine) = np.sqrt(max(1 - y * y, 0.0)), _spun(turns)
+        found[0, i], found[1, i], found[2, i] = flat * sine, y, -flat * cosine
 
 
 @compiled
@@ -221,6 +263,7 @@ def _shine(
     mean: float,
     bright: float,
     radiance: np.ndarray,
+    height_guide: np.ndarray,
     heights: np.ndarray,
     rows: np.ndarray,
     along: np.ndarray,
@@ -232,7 +275,7 @@ def _shine(
 ) -> None:
     """Luminance over the density of both techniques, and the colour of that luminance; in float64 whatever the arrays hold."""
     height, width = radiance.shape[0], radiance.shape[1]
-    faced = normals.shape[1] > 0
+    faced, half = normals.shape[1] > 0, 0.5 * len(height_guide)
     nx, ny, nz = 0.0, 1.0, 0.0
     for i in range(u.shape[1]):
         s, t = np.float64(u[0, i]), np.float64(u[1, i])
@@ -240,14 +283,14 @@ def _shine(
             nx, ny, nz = np.float64(normals[0, i]), np.float64(normals[1, i]), np.float64(normals[2, i])
         if s < share:
             row, column, y, turns = _draw(min(s / share, _BELOW_ONE), t, heights, rows, along, row_guide, along_guide)
-            flat, angle = np.sqrt(max(1 - y * y, 0.0)), 2 * np.pi * turns - turn
-            x, z = flat * np.sin(angle), -flat * np.cos(angle)
+            flat, (along_z, along_x) = np.sqrt(max(1 - y * y, 0.0)), _spun(turns - turn)
+            x, z = flat * along_x, -flat * along_z
             cosine = nx * x + ny * y + nz * z
         else:
             s = (s - share) / (1 - share)
             cosine = np.sqrt(1 - s) if faced else 1 - 2 * s
-            flat, angle = np.sqrt(max(1 - cosine * cosine, 0.0)), 2 * np.pi * t
-            right, up = flat * np.cos(angle), flat * np.sin(angle)
+            flat, (right, up) = np.sqrt(max(1 - cosine * cosine, 0.0)), _spun(t)
+            right, up = right * flat, up * flat
             # Duff et al., "Building an Orthonormal Basis, Revisited", JCGT 2017.
             sign = np.copysign(1.0, nz)
             a = -1 / (sign + nz)
@@ -255,8 +298,10 @@ def _shine(
             x = right * (1 + sign * nx * nx * a) + up * b + cosine * nx
             y = right * sign * b + up * (sign + ny * ny * a) + cosine * ny
             z = -right * sign * nx - up * ny + cosine * nz
-            row = min(int(np.arccos(min(max(y, -1.0), 1.0)) * (height / np.pi)), height - 1)
-            turns = 0.5 + (np.arctan2(x, -z) + turn) / (2 * np.pi)
+            row = height_guide[min(max(int((1 - y) * half), 0), len(height_guide) - 1)]
+            while row < height - 1 and heights[row + 1] > y:
+                row += 1
+            turns = 0.5 + _turns_of(x, -z) + turn
             column = min(int((turns - np.floor(turns)) * width), width - 1)
         red, green, blue = radiance[row, column, 0], radiance[row, column, 1], radiance[row, column, 2]
         luminance = 0.2126 * red + 0.7152 * green + 0.0722 * blue
