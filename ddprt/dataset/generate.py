@@ -333,7 +333,7 @@ class _Bake:
             write_tensors(self.folder / "points.safetensors", {**tensors, **spans})
             manifest.add("points.safetensors")
         if not manifest.holds("scene.safetensors"):
-            write_tensors(self.folder / "scene.safetensors", {"corners": self.scene.corners, "uv": atlas.uv})
+            write_tensors(self.folder / "scene.safetensors", store.scene_tensors(self.scene, atlas))
             manifest.add("scene.safetensors")
         if not all(manifest.holds(name) for name in store.ATLAS_FILES):
             store.write_atlas(self.folder, atlas, manifest)

@@ -24,6 +24,8 @@ from ddprt.lights import Lighting, parse_lighting
 from ddprt.sampling.points import Samples
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.exr import exposure_for, read_exr, write_exr
+from ddprt.scene.holes import Holes
+from ddprt.scene.mesh import Scene
 
 SCHEMA = 1
 _GBUFFER = ("position", "normal", "geometric_normal", "albedo", "area", "coverage")
@@ -107,6 +109,20 @@ class Dataset:
     def uv(self) -> Float64[np.ndarray, "triangles 3 2"] | None:
         """Lightmap coordinates of these corners, origin top-left; None in bakes of older versions."""
         return read_tensors(self.folder / "scene.safetensors").get("uv")
+
+    @cached_property
+    def holes(self) -> Holes | None:
+        """Where rays pass through these triangles; None where they nowhere do.
+
+        Raises:
+          UserError: the masks do not fit the triangles.
+        """
+        path = self.folder / "scene.safetensors"
+        tensors = read_tensors(path)
+        try:
+            return Holes.read(tensors, len(tensors["corners"]))
+        except ValueError as error:
+            raise UserError(f"{path}: {error}; bake it again") from None
 
     def maps(self, kind: str, indices: Sequence[int]) -> Float32[np.ndarray, "lightings texels 3"]:
         """Lightmaps of the covered texels in W/m²; kind is "direct", "indirect" or (held-out lightings) "noise"."""
@@ -350,6 +366,12 @@ def write_atlas(folder: Path, atlas: Atlas, manifest: Manifest) -> None:
         image = atlas.image(values.reshape(atlas.count, -1))
         write_exr(folder / "atlas" / f"{name}.exr", image)
         manifest.add(f"atlas/{name}.exr")
+
+
+def scene_tensors(scene: Scene, atlas: Atlas) -> dict[str, np.ndarray]:
+    """What a dataset keeps of a scene: what casts shadows, and where it lies on the lightmap."""
+    holes = Holes.of(scene)
+    return {"corners": scene.corners, "uv": atlas.uv, **(holes.tensors if holes else {})}
 
 
 def write_description(folder: Path, description: dict[str, Any]) -> None:

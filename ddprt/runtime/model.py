@@ -20,6 +20,7 @@ from ddprt.methods.method import Frame, Relighter
 from ddprt.runtime.coefficients import Coefficients
 from ddprt.runtime.trust import Trust, Yardstick
 from ddprt.sampling.points import Samples
+from ddprt.scene.holes import Holes
 
 _LARGEST = float(np.finfo(np.float32).max)
 _NOT_FINITE = "values: got NaN or infinity in float32, expected finite W/m²; check how the points are shaded"
@@ -43,6 +44,7 @@ class Model:
       uv: lightmap coordinates of the occluders' corners, origin top-left; None in models of older versions.
       yardstick: what trust is measured with; None likewise.
       layers: what answers for light besides the lightmap, by name of the layer.
+      holes: where light passes through the occluders; None where it nowhere does.
     """
 
     method: str
@@ -58,6 +60,7 @@ class Model:
     uv: np.ndarray | None = None
     yardstick: Yardstick | None = None
     layers: "Mapping[str, LayerModel]" = field(default_factory=dict)
+    holes: Holes | None = None
 
     def predict(self, values: Any, *, clamp: bool | str = True, fade: bool = False) -> np.ndarray:
         """Indirect irradiance from measured light.
@@ -197,7 +200,7 @@ class Model:
     def _tracer(self) -> Any:
         from ddprt.transport.embree import Tracer
 
-        return Tracer(self.occluders)
+        return Tracer(self.occluders, holes=self.holes)
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,6 +23,7 @@ from ddprt.methods.method import FitReport
 from ddprt.runtime.model import LayerModel, Model
 from ddprt.runtime.trust import Yardstick
 from ddprt.sampling.points import Samples
+from ddprt.scene.holes import Holes
 
 SCHEMA = 1
 _PLACES = ("position", "weight", "texel")  # tensors of a layer
@@ -90,6 +91,8 @@ def save_model(model: Model, folder: Path) -> None:
     for name, part in model.layers.items():
         tensors |= {f"layers.{name}.{entry}": getattr(part.layer, entry) for entry in _PLACES}
         save_model(part.model, folder / "layers" / name)
+    if model.holes is not None:
+        tensors |= model.holes.tensors
     trust: dict[str, float] = {}
     if model.yardstick is not None:
         for entry in fields(model.yardstick):
@@ -227,6 +230,7 @@ def _assemble(
         uv,
         None if checked.trust is None else _yardstick(checked.trust, tensors),
         {entry.name: _layer_model(entry, tensors, parts[entry.name]) for entry in checked.layers},
+        Holes.read(tensors, len(tensors["scene.corners"])),
     )
 
 

@@ -17,8 +17,10 @@ from ddprt.config import Config
 from ddprt.errors import UserError
 from ddprt.lights import LIGHTS, Lighting, parse_lighting
 from ddprt.scene.files import load_scene
+from ddprt.scene.holes import pierced
 from ddprt.scene.material import Material
 from ddprt.scene.mesh import Scene
+from ddprt.scene.sheets import backs, without_backs
 
 _FLAT = 1e-6  # of the radius: how far a corner may stand before a triangle's plane and still be in it
 _CHUNK = 1 << 22
@@ -191,9 +193,25 @@ def _material(has: Callable[[Material], object], lacking: str) -> Callable[[str,
     return decide
 
 
+def _without_cutouts(scene: Scene) -> Scene:
+    return scene.made_of(lambda material: replace(material, cutout=None) if material.cutout else material)
+
+
+def _two_sided(name: str, question: Question) -> Effect:
+    users = question.users(lambda material: material.two_sided)
+    count = int(np.count_nonzero(backs(question.scene))) if users else 0
+    why = f"{users}: {count} triangles have a back of their own" if count else "no open surface has two sides"
+    return Effect(name, count > 0, why)
+
+
 EFFECTS: Catalogue[Entry] = Catalogue(
     "effect",
-    {"diffuse bounces": Entry(_diffuse_bounces), **{f"{kind} lights": _light_kind(kind) for kind in LIGHTS}},
+    {
+        "diffuse bounces": Entry(_diffuse_bounces),
+        **{f"{kind} lights": _light_kind(kind) for kind in LIGHTS},
+        "cut-outs": Entry(_material(pierced, "no material has holes"), "cutouts", _without_cutouts),
+        "two-sided sheets": Entry(_two_sided, without=without_backs),
+    },
 )
 
 
