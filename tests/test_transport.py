@@ -378,7 +378,7 @@ def test_a_plan_names_every_effect_and_why(cornell: Scene) -> None:
     called = {effect.name: effect.called for effect in decided.effects[: 1 + len(LIGHTS)]}
     assert called == {
         "diffuse bounces": True, "point lights": True, "spot lights": True, "directional lights": True, "rect lights": False,
-        "sphere lights": False,
+        "sphere lights": False, "environment lights": False,
     }  # fmt: skip
     assert decided.bounces == -1
     assert "white" in decided.effects[0].why
