@@ -58,7 +58,8 @@ class IndirectBake:
             sent = cache(sent)  # of maps and probes
         self._maps(split, indices, sent)
         if self._probes:
-            self._probes.run(split, indices, sent, self.progress, dark=self.effects.bounces == 0)
+            dark = self.config.transport.bounces == 0 or not any(max(entry.albedo) for entry in self.scene.materials)
+            self._probes.run(split, indices, sent, self.progress, dark=dark)
 
     @cached_property
     def _probes(self) -> ProbeBake | None:
@@ -92,7 +93,8 @@ class IndirectBake:
 
     def _sent(self, split: str, indices: list[int], half: int) -> Sent:
         """What the senders of a half of a split send to its lightings' maps and probes."""
-        operator, stream, bounces = self._operator, f"{split} {half}", self.effects.bounces
+        operator, stream = self._operator, f"{split} {half}"
+        bounces = self.effects.bounces or 1  # of a lonely convex body, whose light reaches probes alone
         direct = self._averaged(operator, indices, half)
         bounced = operator.bounce(direct, seed=self.config.seed, stream=stream, bounces=bounces)
         near = operator.near([self.dataset.lightings[index] for index in indices], direct, bounces=bounces)

@@ -121,7 +121,7 @@ class ProbeBake:
           split, indices: "train" (with validation) or "test", and its lightings.
           sent: the light of each half.
           progress: told of the stage, and of probes that are not in free air.
-          dark: no light bounces.
+          dark: no light leaves a surface, or none is to be followed.
         """
         kinds = ("light", "noise")[: 1 + (split == "test")]
         names = {index: [layer_name(NAME, index, kind) for kind in kinds] for index in indices}
