@@ -22,6 +22,7 @@ from ddprt.harmonics import clamped_cosine, harmonics
 from ddprt.lights import parse_lighting
 from ddprt.progress import Progress
 from ddprt.report.layers import layer_scores
+from ddprt.runtime.model import Model
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.library import build
 from ddprt.scene.mesh import Scene
@@ -33,7 +34,7 @@ from ddprt.transport.operator import Operator
 DOCS = Path(__file__).parent.parent / "docs" / "effects.md"
 EPS = float(np.finfo(np.float32).eps)
 RAYS = 4096
-GRID = (3, 3, 3)
+GRID = (4, 4, 4)
 LAMP = parse_lighting({"type": "point", "position": [0.28, 0.45, 0.28], "intensity": [1, 1, 1]})
 
 
@@ -164,14 +165,11 @@ def test_without_probes_nothing_is_imported_and_all_bits_are_the_same(
     assert line["forced"]
     assert not line["called"]
     assert line["bound"] == 0
-    assert "3 x 3 x 3" in line["why"]
+    assert "4 x 4 x 4" in line["why"]
     for one in (third, plain):
         del one.description["plan"]
         del one.description["ddprt"]
     assert third.description == plain.description
-    models = [ddprt.fit(one, bases=4) for one in (data, third)]
-    values = data.values([0, 5], 16, "radiosity")
-    np.testing.assert_array_equal(models[0].predict(values), models[1].predict(values))
 
 
 def test_light_is_that_of_the_reference(cornell: Scene) -> None:
@@ -202,7 +200,7 @@ def test_light_is_that_of_the_reference(cornell: Scene) -> None:
         f"z {z.mean():+.3f} +- {z.std():.3f}; mean {z[:, 0].mean():+.3f}, bias {ours[:, 0].sum() / truth[:, 0].sum() - 1:+.4f}"
     )
     assert abs(z.mean()) < 4 / np.sqrt(z.size)
-    assert abs(z.std() - 1) < 0.3
+    assert abs(z.std() - 1) < 4 / np.sqrt(2 * z.size)
 
 
 def test_probes_in_blocks_and_behind_walls_are_found(cornell: Scene, data: Dataset) -> None:
@@ -221,10 +219,16 @@ def test_probes_in_blocks_and_behind_walls_are_found(cornell: Scene, data: Datas
     assert light[:, ~closed, 0].all()
 
 
-def test_a_fit_passes_over_what_counts_nothing(data: Dataset) -> None:
+@pytest.fixture(scope="module")
+def models(data: Dataset) -> dict[str, Model]:
+    other: dict[str, Any] = {"channels": "multi", "centre": "mean", "space": "gamma"}
+    return {"plain": ddprt.fit(data, bases=4), "other": ddprt.fit(data, bases=4, **other)}
+
+
+def test_a_fit_passes_over_what_counts_nothing(data: Dataset, models: dict[str, Model]) -> None:
     layer, test = read_layer(data, "probes"), data.split("test")
-    for channels in ("mono", "multi"):
-        part = ddprt.fit(data, bases=4, channels=channels).layers["probes"]
+    for model in models.values():
+        part = model.layers["probes"]
         light = part.predict(data.values(test, 16, "radiosity"))
         assert np.isfinite(light).all()
         assert not light[:, layer.weight == 0].any()
@@ -251,7 +255,7 @@ def test_bakes_go_on_with_the_same_bits(data: Dataset, cornell: Scene, tmp_path:
 
 
 @pytest.mark.parametrize(
-    "change", [{"rays": 1024}, {"grid": (3, 3, 4)}, {"region_high": (1, 1, 0.9)}, {"grid": (0, 0, 0)}], ids=str
+    "change", [{"rays": 1024}, {"grid": (4, 4, 3)}, {"region_high": (1, 1, 0.9)}, {"grid": (0, 0, 0)}], ids=str
 )
 def test_other_probes_are_another_dataset(data: Dataset, cornell: Scene, change: dict[str, Any]) -> None:
     with pytest.raises(UserError, match="holds another dataset"):
@@ -265,15 +269,17 @@ def test_rays_follow_the_noise_that_is_aimed_at(cornell: Scene) -> None:
     with pytest.warns(UserWarning, match="inside solids"):
         data = ddprt.bake(cornell, config=config, progress=shown)
     (stage,) = (stage for stage in shown.stages if stage["name"] == "probes test")
-    found = layer_scores(data, ddprt.fit(data, bases=2))["probes"]
+    layer, test = read_layer(data, "probes"), data.split("test")
+    light, noise = (read_light(data, layer, test, kind)[:, layer.weight > 0].astype(float) for kind in ("light", "noise"))
+    found = np.sqrt((noise**2).sum(2).mean()) / light[:, :, 0].mean()  # both in units of sqrt(4 pi)
     assert stage["noise_expected"] <= 0.03
-    assert found["noise_relative_rmse"] == pytest.approx(stage["noise_expected"], rel=0.5)  # 2 lightings, 27 probes
+    assert found == pytest.approx(stage["noise_expected"], rel=0.5)  # of 2 lightings, told by 61 probes
     gathered_rays = stage["samples"] * stage["in_the_open"]
     assert stage["rays"] >= gathered_rays + 2 * (64 + 256) * stage["in_the_open"]  # both pilots
 
 
-def test_scores_are_of_irradiance_over_the_sphere(data: Dataset) -> None:
-    model, test = ddprt.fit(data, bases=4), data.split("test")
+def test_scores_are_of_irradiance_over_the_sphere(data: Dataset, models: dict[str, Model]) -> None:
+    model, test = models["plain"], data.split("test")
     part, values = model.layers["probes"], data.values(data.split("test"), 16, "radiosity")
     found = layer_scores(data, model)["probes"]
     z, step = np.polynomial.legendre.leggauss(4)
@@ -294,7 +300,7 @@ def test_scores_are_of_irradiance_over_the_sphere(data: Dataset) -> None:
 
 
 def grid(weight: np.ndarray | None = None) -> Layer:
-    axes = [0.0, 1.0, 3.0], [2.0, 4.0], [1.0]
+    axes = [0.0, 1.0, 3.5], [2.0, 4.0], [1.0]
     place = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     return Layer("probes", "irradiance", 2, place, np.ones(6) if weight is None else weight, np.full(6, -1))
 
@@ -325,13 +331,13 @@ def test_a_list_of_probes_is_no_grid() -> None:
         ProbeGrid.of(replace(layer, position=layer.position[::-1].copy()))
 
 
-@pytest.mark.parametrize("options", [{}, {"space": "gamma"}, {"channels": "multi", "centre": "mean"}], ids=str)
-def test_the_documented_decoder_reproduces_probes(options: dict[str, Any], data: Dataset, tmp_path: Path) -> None:
+@pytest.mark.parametrize("which", ["plain", "other"])
+def test_the_documented_decoder_reproduces_probes(which: str, models: dict[str, Model], data: Dataset, tmp_path: Path) -> None:
     """Irradiance from the exported files alone, by the block that docs/effects.md prints, and the golden numbers."""
-    model = ddprt.fit(data, bases=4, **options)
+    model = models[which]
     files = export_probes(model, tmp_path)
     assert [file.name for file in files] == ["probes.safetensors", "probes.json"]
-    block = re.search(r"```python\n(.*?def probes.*?)```", DOCS.read_text(), re.DOTALL)
+    block = re.search(r"```python\n((?:(?!```).)*?def probes.*?)```", DOCS.read_text(), re.DOTALL)
     assert block
     scope: dict[str, Any] = {}
     exec(block[1], scope)

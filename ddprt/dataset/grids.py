@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ddprt.axes import Float, Float32, Float64, Int
+from ddprt.axes import Float, Float32, Int
 from ddprt.dataset.layers import Layer
 from ddprt.errors import UserError
 
@@ -19,7 +19,7 @@ class ProbeGrid:
       source: whose light each place has: its own, or that of the nearest place in free air.
     """
 
-    axes: tuple[Float64[np.ndarray, " n"], ...]
+    axes: tuple[np.ndarray, ...]
     source: Int[np.ndarray, " places"]
 
     @classmethod
