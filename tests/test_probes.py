@@ -81,7 +81,10 @@ def test_a_lit_square_seen_from_above() -> None:
             "probes": {"rays": RAYS, "file": "given"},
         }
     )
-    data = baked(scene, config, [sun] * 10, [at.tolist()])
+    shown = Progress(quiet=True)
+    data = baked(scene, config, [sun] * 10, [at.tolist()], progress=shown)
+    traced = [stage["rays"] for stage in shown.stages if str(stage["name"]).startswith("probes")]
+    assert traced == [RAYS, 2 * RAYS]  # none between surfaces that do not face each other
     assert not data.maps("indirect", [0]).any()
     layer = read_layer(data, "probes")
     found = read_light(data, layer, [0])[0, 0]
@@ -112,7 +115,7 @@ def job(**changes: Any) -> Config:
     return checked(document)
 
 
-def baked(scene: Scene, config: Config, lightings: Any, position: Any) -> Dataset:
+def baked(scene: Scene, config: Config, lightings: Any, position: Any, **options: Any) -> Dataset:
     """A bake with listed probes."""
     import tempfile
 
@@ -120,7 +123,7 @@ def baked(scene: Scene, config: Config, lightings: Any, position: Any) -> Datase
         file.write(json.dumps(position))
         file.flush()
         config = config.model_copy(update={"probes": config.probes.model_copy(update={"file": file.name})})
-        return ddprt.bake(scene, lightings, config=config)
+        return ddprt.bake(scene, lightings, config=config, **options)
 
 
 @pytest.fixture(scope="module")
