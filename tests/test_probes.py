@@ -15,7 +15,8 @@ import ddprt
 from ddprt.config import Config, checked
 from ddprt.dataset.grids import ProbeGrid, nearest_valid
 from ddprt.dataset.layers import Layer, read_layer, read_light
-from ddprt.dataset.store import Dataset, Manifest, layer_name
+from ddprt.dataset.manifest import Manifest, layer_name
+from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.export.probes import export_probes
 from ddprt.harmonics import clamped_cosine, harmonics

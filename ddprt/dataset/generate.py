@@ -15,13 +15,13 @@ import numpy as np
 
 from ddprt import __version__, seeds
 from ddprt.config import Config, checked
-from ddprt.dataset import store
+from ddprt.dataset import probes, store
 from ddprt.dataset.denoise import find_denoiser
 from ddprt.dataset.indirect import IndirectBake
-from ddprt.dataset.probes import probe_layers
+from ddprt.dataset.manifest import Manifest, map_name
 from ddprt.dataset.scratch import remove_left
 from ddprt.dataset.splits import SPLITS, Once, Splits, check_choice, choose_lightings, chosen, doubt, grouped
-from ddprt.dataset.store import Dataset, Manifest, map_name
+from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.files import alone_in, write_tensors
 from ddprt.lights import Lighting, lighting_json
@@ -112,7 +112,7 @@ def baked_settings(config: Config, scene: Scene) -> dict[str, Any]:
         "seed": config.seed,
         "transport": transport | {"integrator": "operator" if transport["integrator"] == "auto" else transport["integrator"]},
         "placing": config.points.model_dump(exclude={"quantity"}),
-        "layers": probe_layers(config, scene),
+        "layers": probes.probe_layers(config, scene),
     }
 
 
@@ -333,7 +333,7 @@ class _Bake:
             write_tensors(self.folder / "points.safetensors", {**tensors, **spans})
             manifest.add("points.safetensors")
         if not manifest.holds("scene.safetensors"):
-            write_tensors(self.folder / "scene.safetensors", {"corners": self.scene.corners, "uv": atlas.uv})
+            write_tensors(self.folder / "scene.safetensors", store.scene_tensors(self.scene, atlas))
             manifest.add("scene.safetensors")
         if not all(manifest.holds(name) for name in store.ATLAS_FILES):
             store.write_atlas(self.folder, atlas, manifest)

@@ -15,7 +15,8 @@ import numpy as np
 from ddprt.axes import Float32
 from ddprt.config import Config
 from ddprt.dataset.layers import Layer, read_layer, write_light, write_places
-from ddprt.dataset.store import Dataset, Manifest, layer_name
+from ddprt.dataset.manifest import Manifest, layer_name
+from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.progress import Progress
 from ddprt.scene.atlas import Atlas
