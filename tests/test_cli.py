@@ -92,7 +92,7 @@ def test_run_leaves_what_is_promised(done: Path, job: Path) -> None:
     assert bounces["rays"] > 0
     assert 0 < bounces["energy_share"] < 1
     assert sum(effect["energy_share"] for effect in run["effects"]) == pytest.approx(1)
-    assert [effect["rays"] for effect in run["effects"] if not effect["called"]] == [0] * 4
+    assert not any(effect["rays"] for effect in run["effects"] if not effect["called"])
 
 
 def test_resolved_configuration_runs_again_without_baking(done: Path, capfd: pytest.CaptureFixture) -> None:
