@@ -5,10 +5,10 @@ is left out, an upper bound of the light it could have added. A new effect is on
 plan calls for it, and one entry of `EFFECTS`, which decides by what scene and lightings say of themselves.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from importlib import import_module
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 
 import numpy as np
 
@@ -16,9 +16,11 @@ from ddprt.catalogue import Catalogue
 from ddprt.config import Config
 from ddprt.errors import UserError
 from ddprt.lights import LIGHTS, Lighting, parse_lighting
+from ddprt.progress import amount
 from ddprt.scene.files import load_scene
 from ddprt.scene.material import Material
 from ddprt.scene.mesh import Scene
+from ddprt.sections import TransportConfig
 
 _FLAT = 1e-6  # of the radius: how far a corner may stand before a triangle's plane and still be in it
 _CHUNK = 1 << 22
@@ -50,10 +52,32 @@ class Plan:
     Attributes:
       effects: every entry of `EFFECTS`, in order.
       bounces: -1 follows light until nothing is left, 0 traces none.
+      costs: what effects that are called for will take, in words, by name, as far as scene and lightings tell.
     """
 
     effects: tuple[Effect, ...]
     bounces: int
+    costs: Mapping[str, str] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return "\n".join(self.lines())
+
+    def lines(self, costs: Mapping[str, str] = MappingProxyType({})) -> list[str]:
+        """A line for each effect: called for or not, why, and its cost or the bound of what leaving it out can cost.
+
+        Args:
+          costs: in words, by name of the effect, where more is known than the plan knew.
+        """
+        costs, rows = {**self.costs, **costs}, []
+        for effect in self.effects:
+            most = "any amount" if effect.bound is None else f"{effect.bound:.2g}"
+            cut = effect.bound is None or effect.bound > 0
+            told = [costs[effect.name]] if effect.called and effect.name in costs else []
+            told += [f"at most {most} of the direct light is left out"] if effect.called and cut else []
+            told += [] if effect.called else [f"at most {most} of the direct light"]
+            state = f"{'called for' if effect.called else 'left out'}{' (forced)' if effect.forced else ''}"
+            rows.append("; ".join([f"{effect.name}: {state}: {effect.why}", *told]))
+        return rows
 
     def called(self, name: str) -> bool:
         """Whether an effect is simulated."""
@@ -71,11 +95,13 @@ class Question:
     Attributes:
       scene, lightings: of the bake.
       bounces: asked for; -1 lets the scene decide.
+      direct_samples: shadow rays per texel and light.
     """
 
     scene: Scene
     lightings: Sequence[Lighting]
     bounces: int = -1
+    direct_samples: int = TransportConfig().direct_samples
 
     def users(self, has: Callable[[Material], object]) -> str:
         """The materials in use that have something, in words; empty where none has."""
@@ -88,36 +114,52 @@ class Entry:
     """How an effect is decided on, and where it lives.
 
     Attributes:
-      decide: the line of a plan that nobody forces; never imports the effect's file.
+      decide: the line of a plan that nobody forces; never imports the effect's file. What can be forced is decided on by the
+        scene alone.
       module: its file in `ddprt.transport`; empty for what transport always has.
       without: the scene with what calls for the effect taken out; None where it cannot be forced.
       left: bound of the light left out when it is forced off; None where it is unbounded.
+      cost: what it will take, in words; empty where scene and lightings do not tell.
     """
 
     decide: Callable[[str, Question], Effect]
     module: str = ""
     without: Callable[[Scene], Scene] | None = None
     left: Callable[[Question], float | None] = lambda question: None
+    cost: Callable[[Question], str] = lambda question: ""
 
 
-def plan(scene: Scene, lightings: Sequence[Lighting], *, bounces: int = -1) -> Plan:
+def plan(
+    scene: Scene,
+    lightings: Sequence[Lighting],
+    *,
+    bounces: int = -1,
+    direct_samples: int = TransportConfig().direct_samples,
+) -> Plan:
     """Decides what to simulate.
 
     Args:
       scene: its materials and shape; from `force` where the user decides.
       lightings: all that will be baked.
       bounces: -1 lets the scene decide; 0 and up is forced.
+      direct_samples: shadow rays per texel and light, for what it will cost.
+    Returns:
+      A plan; printed, it has a line for each effect.
     """
     parsed = [parse_lighting(lighting, f"lighting {index}") for index, lighting in enumerate(lightings)]
-    effects = tuple(_decided(name, entry, Question(scene, parsed, bounces)) for name, entry in EFFECTS.items())
-    return Plan(effects, bounces if effects[0].called else 0)
+    question = Question(scene, parsed, bounces, direct_samples)
+    effects = tuple(_decided(name, entry, question) for name, entry in EFFECTS.items())
+    told = {effect.name: EFFECTS[effect.name].cost(question) for effect in effects if effect.called}
+    return Plan(effects, bounces if effects[0].called else 0, {name: cost for name, cost in told.items() if cost})
 
 
 def force(scene: Scene, *, on: Sequence[str] = (), off: Sequence[str] = ()) -> Scene:
     """A scene whose plan simulates some effects, or leaves them out, whatever it calls for by itself.
 
+    What is said of an effect replaces what was said of it before, and what changes nothing gives the scene itself back.
+
     Args:
-      scene: from `ddprt.load_scene`.
+      scene: from `ddprt.load_scene` or from here.
       on, off: entries of `EFFECTS`. What is off is left out by taking out of the scene what calls for it.
     Raises:
       UserError: unknown names, effects that cannot be forced, or both on and off.
@@ -129,11 +171,17 @@ def force(scene: Scene, *, on: Sequence[str] = (), off: Sequence[str] = ()) -> S
             raise UserError(f'effects: got "{name}", which cannot be forced, expected some of {can}{also}')
         if name in on and name in off:
             raise UserError(f'effects: got "{name}" both on and off, expected one or the other; choose')
-    whole, left = scene.whole or scene, scene
-    for name in off:
-        without = EFFECTS[name].without
-        left = without(left) if without else left
-    return replace(left, whole=whole if left is not whole else None, forced=tuple(sorted({*scene.forced, *on})))
+    if not on and not off:
+        return scene
+    forced, refused = {*scene.forced, *on} - {*off}, {*scene.refused, *off} - {*on}
+    unforced = replace(scene.whole or scene, forced=(), refused=())
+    alone = {name: EFFECTS[name].decide(name, Question(unforced, ())) for name in {*forced, *refused}}
+    forced = {name for name in forced if not alone[name].called or alone[name].bound != 0}  # the others change nothing
+    left = whole = replace(unforced, forced=tuple(sorted(forced)))
+    for name, entry in EFFECTS.items():
+        if name in refused and alone[name].called and entry.without:
+            left = entry.without(left)
+    return replace(left, whole=whole if left is not whole else None, refused=tuple(sorted(refused)))
 
 
 def configured_scene(config: Config) -> Scene:
@@ -142,15 +190,16 @@ def configured_scene(config: Config) -> Scene:
 
 
 def _decided(name: str, entry: Entry, question: Question) -> Effect:
-    effect, whole = entry.decide(name, question), question.scene.whole
-    if effect.called:
-        return effect
-    if name in question.scene.forced:
-        return replace(effect, called=True, why=f"forced on, though {effect.why}", bound=0.0, forced=True)
-    asked = replace(question, scene=whole) if whole else question
-    wished = entry.decide(name, asked)
-    if entry.without and wished.called:
-        return Effect(name, False, f"forced off, though it is called for: {wished.why}", entry.left(asked), True)
+    """What is forced off is judged by the whole scene; no entry's judgement knows what is forced."""
+    scene = question.scene
+    judged = (name in scene.refused and scene.whole) or scene
+    asked = replace(question, scene=replace(judged, forced=(), refused=()) if scene.forced or scene.refused else scene)
+    effect = entry.decide(name, asked)
+    if name in scene.refused and effect.called:
+        return Effect(name, False, f"forced off, though it is called for: {effect.why}", entry.left(asked), True)
+    if name in scene.forced:
+        why = f"forced on in full: {effect.why}" if effect.called else f"forced on, though {effect.why}"
+        return Effect(name, True, why, 0.0, True)
     return effect
 
 
@@ -171,6 +220,10 @@ def _diffuse_bounces(name: str, question: Question) -> Effect:
     return Effect(name, True, why)
 
 
+def _gathered(question: Question) -> str:
+    return "as many rays as the noise that is asked for takes, which `ddprt inspect` tries"
+
+
 def _light_kind(kind: str) -> Entry:
     def decide(name: str, question: Question) -> Effect:
         lightings = question.lightings
@@ -178,7 +231,12 @@ def _light_kind(kind: str) -> Entry:
         why = f"{len(users)} of {len(lightings)} lightings, first {users[0]}" if users else "no lighting has one"
         return Effect(name, bool(users), why)
 
-    return Entry(decide)
+    def cost(question: Question) -> str:
+        count = sum(light.kind == kind for lighting in question.lightings for light in lighting)
+        rays = amount(count * question.direct_samples)
+        return f"up to {rays} shadow rays per texel for all lightings, and more near lamps"
+
+    return Entry(decide, cost=cost)
 
 
 def _material(has: Callable[[Material], object], lacking: str) -> Callable[[str, Question], Effect]:
@@ -193,7 +251,7 @@ def _material(has: Callable[[Material], object], lacking: str) -> Callable[[str,
 
 EFFECTS: Catalogue[Entry] = Catalogue(
     "effect",
-    {"diffuse bounces": Entry(_diffuse_bounces), **{f"{kind} lights": _light_kind(kind) for kind in LIGHTS}},
+    {"diffuse bounces": Entry(_diffuse_bounces, cost=_gathered), **{f"{kind} lights": _light_kind(kind) for kind in LIGHTS}},
 )
 
 
