@@ -21,7 +21,7 @@ def describe(source: str, overrides: dict[str, str]) -> str:
       source: a configuration, a scene name or a mesh file.
       overrides: of the configuration.
     """
-    from ddprt.dataset.generate import check_points
+    from ddprt.dataset.generate import baked_settings, check_points
     from ddprt.transport.effects import configured_scene, plan
     from ddprt.transport.embree import Tracer
     from ddprt.transport.openness import build_open_atlas
@@ -63,7 +63,10 @@ def describe(source: str, overrides: dict[str, str]) -> str:
     if lightings:
         direct, costs = _direct(config, tracer, atlas, lightings, count)
         bake += _darkness(lightings, direct, scene, tracer)
-        if any(light.any() for light in direct) and effects.bounces:
+        integrator = baked_settings(config, scene)["transport"]["integrator"]
+        if effects.bounces and integrator != "operator":
+            bake.append(f"            indirect light by {integrator}, whose rays `ddprt bake --dry-run` tells")
+        elif effects.bounces and any(light.any() for light in direct):
             told, costs["diffuse bounces"] = _gathering(config, tracer, atlas, lightings, direct)
             bake += told
     known = [line for line in effects.lines(costs) if lightings or not line.split(":")[0].endswith(" lights")]
