@@ -288,8 +288,8 @@ def _effects(effects: Plan, stages: list[dict[str, Any]], data: Dataset) -> list
             energy[kind] = energy.get(kind, 0.0) + float(amount) / len(lighting)
     total, rows = sum(energy.values()), []
     for effect in effects.effects:
-        light = effect.name.removesuffix(" lights") in LIGHTS
-        begins = "indirect" if effect.name == "diffuse bounces" else "direct" if light else effect.name
+        lights = effect.name.removesuffix(" lights") in LIGHTS
+        begins = "indirect" if effect.name == "diffuse bounces" else "direct" if lights else effect.name
         own = [stage for stage in stages if f"{stage['name']} ".startswith(f"{begins} ") and effect.called]
         rays, seconds = sum(int(s.get("rays", 0)) for s in own), sum(float(s["seconds"]) for s in own)
         apart = bool(own) or not effect.called
