@@ -304,5 +304,6 @@ def _effects(effects: Plan, stages: list[dict[str, Any]], data: Dataset) -> list
 
 def _constant(data: Dataset, weight: np.ndarray) -> dict[str, float]:
     """Light that no lighting changes, of each lighting, where the dataset has some."""
-    constant = getattr(data, "constant", None)
-    return {} if constant is None else {"emission": len(data.lightings) * float(np.einsum("tc,t->", constant, weight))}
+    if data.constant is None:
+        return {}
+    return {"emission": len(data.lightings) * float(np.einsum("tc,t->", data.constant, weight))}

@@ -11,7 +11,8 @@ from ddprt import warp
 from ddprt.config import checked
 from ddprt.dataset import store
 from ddprt.dataset.layers import Layer, LayerData, layers, read_layer, read_light, write_light, write_places
-from ddprt.dataset.store import Dataset, Manifest
+from ddprt.dataset.manifest import Manifest
+from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.harmonics import harmonics
 
@@ -92,7 +93,7 @@ def test_the_lightmap_is_learned_as_without_layers(data: Dataset, plain: Dataset
 
 
 def test_a_layer_is_learned_with_its_sign(data: Dataset) -> None:
-    """Answers are nearer than any without negative coefficients could be, and the law of the mean holds for them as they are."""
+    """Answers are nearer than any without negative coefficients could be, and beat the mean of them as they are."""
     model, test = ddprt.fit(data, bases=12), data.split("test")
     part = model.layers["probes"]
     truth = read_light(data, part.layer, test)

@@ -216,8 +216,8 @@ def _there(values: Float32[np.ndarray, "texels 3"], place: Int[np.ndarray, " oth
 
 def _light(data: Dataset, index: int) -> Float32[np.ndarray, "texels 3"]:
     """What a runtime answers with, W/m²."""
-    light, constant = data.maps("indirect", [index])[0], getattr(data, "constant", None)
-    return light if constant is None else light + constant
+    light = data.maps("indirect", [index])[0]
+    return light if data.constant is None else light + data.constant
 
 
 def _lightings(scene: Scene, config: Config) -> dict[str, list[Lighting]]:
