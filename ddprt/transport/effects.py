@@ -86,8 +86,9 @@ class Plan:
         return any(effect.called for effect in self.effects if effect.name == name)
 
     def module(self, name: str) -> ModuleType | None:
-        """The file of an effect, imported now; None where it is not called for."""
-        return import_module(f"ddprt.transport.{EFFECTS[name].module}") if self.called(name) else None
+        """The file of an effect, imported now; None where it is not called for, or has none of its own."""
+        file = EFFECTS[name].module
+        return import_module(f"ddprt.transport.{file}") if file and self.called(name) else None
 
 
 @dataclass(frozen=True)
