@@ -386,6 +386,11 @@ def test_forced_bounces_come_with_a_bound(bounces: int) -> None:
     assert decided.effects[0].bound == pytest.approx(0.5 ** (bounces + 1) / 0.5)
 
 
+def test_lamps_do_not_bound_the_bounces_of_light_that_is_not_theirs() -> None:
+    assert plan(build("neon"), [CENTRE], bounces=1).effects[0].bound is None
+    assert plan(force(build("neon"), off=["emission"]), [CENTRE], bounces=1).effects[0].bound > 0
+
+
 def test_an_effect_that_cannot_occur_is_not_forced_on() -> None:
     assert plan(build("convex"), [LAMP], bounces=5).bounces == 0
     assert plan(build("furnace", albedo=0, subdivisions=1), [LAMP], bounces=5).bounces == 0

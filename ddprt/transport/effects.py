@@ -215,7 +215,8 @@ def _diffuse_bounces(name: str, question: Question) -> Effect:
     if sees_nothing(question.scene):
         return Effect(name, False, "no surface faces another: the scene is convex seen from outside")
     if bounces >= 0:
-        left = albedo ** (bounces + 1) / (1 - albedo) if albedo < 1 else None
+        glows = any(_brightest(material) for material in question.scene.used_materials)  # with lamps however dim
+        left = albedo ** (bounces + 1) / (1 - albedo) if albedo < 1 and not glows else None
         return Effect(name, bounces > 0, f"forced to {bounces} (largest albedo {albedo:.3g})", left, True)
     why = f'largest albedo {albedo:.3g} ("{brightest.name}"), and surfaces face each other'
     if albedo >= 1:
