@@ -59,7 +59,7 @@ def describe(source: str, overrides: dict[str, str]) -> str:
     count = settings.train + settings.validation + settings.test
     shadow = atlas.count * config.transport.direct_samples * count
     bake = [f"a bake      {count} lightings: {amount(shadow)} shadow rays per lamp"]
-    effects = plan(scene, lightings, bounces=config.transport.bounces)
+    effects = plan(scene, lightings, bounces=config.transport.bounces, probes=config.probes.asked)
     costs: dict[str, str] = {}
     if lightings:
         direct, costs = _direct(config, tracer, atlas, lightings, count)

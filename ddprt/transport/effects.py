@@ -99,12 +99,14 @@ class Question:
       scene, lightings: of the bake.
       bounces: asked for; -1 lets the scene decide.
       direct_samples: shadow rays per texel and light.
+      probes: which are asked for, in words; empty for none.
     """
 
     scene: Scene
     lightings: Sequence[Lighting]
     bounces: int = -1
     direct_samples: int = TransportConfig().direct_samples
+    probes: str = ""
 
     def users(self, has: Callable[[Material], object]) -> str:
         """The materials in use that have something, in words; empty where none has."""
@@ -138,6 +140,7 @@ def plan(
     *,
     bounces: int = -1,
     direct_samples: int = TransportConfig().direct_samples,
+    probes: str = "",
 ) -> Plan:
     """Decides what to simulate.
 
@@ -146,11 +149,12 @@ def plan(
       lightings: all that will be baked.
       bounces: -1 lets the scene decide; 0 and up is forced.
       direct_samples: shadow rays per texel and light, for what it will cost.
+      probes: which are asked for, in words (`config.probes.asked`); empty for none.
     Returns:
       A plan; printed, it has a line for each effect.
     """
     parsed = [parse_lighting(lighting, f"lighting {index}") for index, lighting in enumerate(lightings)]
-    question = Question(scene, parsed, bounces, direct_samples)
+    question = Question(scene, parsed, bounces, direct_samples, probes)
     effects = tuple(_decided(name, entry, question) for name, entry in EFFECTS.items())
     told = {effect.name: EFFECTS[effect.name].cost(question) for effect in effects if effect.called}
     return Plan(effects, bounces if effects[0].called else 0, {name: cost for name, cost in told.items() if cost})
@@ -200,7 +204,7 @@ def _decided(name: str, entry: Entry, question: Question) -> Effect:
     effect = entry.decide(name, asked)
     if name in scene.refused and effect.called:
         return Effect(name, False, f"forced off, though it is called for: {effect.why}", entry.left(asked), True)
-    if name in scene.forced:
+    if name in scene.forced and not (effect.called and effect.bound == 0):
         why = f"forced on in full: {effect.why}" if effect.called else f"forced on, though {effect.why}"
         return Effect(name, True, why, 0.0, True)
     return effect
@@ -283,6 +287,16 @@ def _without_emission(scene: Scene) -> Scene:
     return scene.made_of(lambda material: replace(material, emission=None))
 
 
+def _probes(name: str, question: Question) -> Effect:
+    asked = question.probes
+    return Effect(name, bool(asked), f"the configuration asks for {asked}" if asked else "the configuration asks for none")
+
+
+def probed(config: Config, scene: Scene) -> bool:
+    """Whether a bake has probes, without the rest of its plan."""
+    return _decided("probes", EFFECTS["probes"], Question(scene, (), probes=config.probes.asked)).called
+
+
 EFFECTS: Catalogue[Entry] = Catalogue(
     "effect",
     {
@@ -291,6 +305,7 @@ EFFECTS: Catalogue[Entry] = Catalogue(
         "cut-outs": Entry(_material(pierced, "no material has holes"), "cutouts", _without_cutouts),
         "two-sided sheets": Entry(_two_sided, without=without_backs),
         "emission": Entry(_emission, "emission", _without_emission),
+        "probes": Entry(_probes, "probes", lambda scene: scene, lambda question: 0.0),  # no lightmap has light from them
     },
 )
 
