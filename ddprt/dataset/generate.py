@@ -30,7 +30,7 @@ from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
 from ddprt.sections import PointsConfig
 from ddprt.transport.direct import Texels
-from ddprt.transport.effects import Plan, plan
+from ddprt.transport.effects import Plan, plan, scattering, valid_integrator
 from ddprt.transport.embree import Tracer
 from ddprt.transport.measure import measure
 from ddprt.transport.openness import build_open_atlas
@@ -109,7 +109,7 @@ def baked_settings(config: Config, scene: Scene) -> dict[str, Any]:
         "scene": {"name": scene.name, "digest": scene.digest, "notes": list(scene.notes)},
         "atlas": config.atlas.model_dump(),
         "seed": config.seed,
-        "transport": transport | {"integrator": "operator" if transport["integrator"] == "auto" else transport["integrator"]},
+        "transport": transport | {"integrator": valid_integrator(transport["integrator"], scene)},
         "placing": config.points.model_dump(exclude={"quantity"}),
     }
 
@@ -224,7 +224,9 @@ class _Bake:
             points = {"points": self._points(listed)} if listed else {}
             self._refuse_other(there, {"counts": _counts(_records(entries)), "lightings": _records(entries), **points})
         with self.progress.stage("atlas") as stage:
-            atlas, hidden = build_open_atlas(self.tracer, self.scene, self.config.atlas.resolution, self.config.atlas.padding)
+            atlas, hidden = build_open_atlas(
+                self.tracer, scattering(self.scene), self.config.atlas.resolution, self.config.atlas.padding
+            )
             stage.facts |= {"texels": atlas.count, "texels_per_metre": float(f"{atlas.texels_per_metre:.4g}"), **hidden}
         with self.progress.stage("points") as stage:
             samples = listed or self._sunk(self._placed(atlas), lightings)
@@ -235,7 +237,9 @@ class _Bake:
                 stage.facts |= {"train": sum(split == "train" for split, _ in entries), "shadow_rays": shadow_rays}
             lightings = [lighting for _, lighting in entries]
         effects = plan(self.scene, lightings, bounces=self.config.transport.bounces)
-        if self.config.transport.integrator in ("paths", "reference"):  # the operator tells what it left out, if anything
+        if (
+            valid_integrator(self.config.transport.integrator, self.scene) != "operator"
+        ):  # the operator tells what it left out, if anything
             for effect in effects.effects:
                 if effect.bound is None and not effect.forced:
                     self.progress.warn(f"{effect.name}: {effect.why}")

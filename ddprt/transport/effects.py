@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
@@ -17,8 +18,9 @@ from ddprt.config import Config
 from ddprt.errors import UserError
 from ddprt.lights import LIGHTS, Lighting, parse_lighting
 from ddprt.scene.files import load_scene
-from ddprt.scene.material import Material
+from ddprt.scene.material import Gloss, Material
 from ddprt.scene.mesh import Scene
+from ddprt.transport.embree import Tracer
 
 _FLAT = 1e-6  # of the radius: how far a corner may stand before a triangle's plane and still be in it
 _CHUNK = 1 << 22
@@ -158,7 +160,7 @@ def _diffuse_bounces(name: str, question: Question) -> Effect:
     bounces = question.bounces
     brightest = max(question.scene.materials, key=lambda material: max(material.albedo))
     albedo = max(brightest.albedo)
-    if albedo == 0:
+    if albedo == 0 and not any(glossy(question.scene)):
         return Effect(name, False, "every material is black")
     if sees_nothing(question.scene):
         return Effect(name, False, "no surface faces another: the scene is convex seen from outside")
@@ -191,9 +193,111 @@ def _material(has: Callable[[Material], object], lacking: str) -> Callable[[str,
     return decide
 
 
+def worth_gloss(material: Material) -> bool:
+    """Whether a material is a metal, or its lobe brighter at its peak than a white wall, seen along the normal.
+
+    That peak is f0 / (4 pi roughness^4) against 1 / pi: a roughness of 0.32 for the usual reflectance of 0.04.
+    """
+    gloss = material.gloss
+    if gloss is None:
+        return False
+    roughness, metallic = _extremes(gloss)
+    return metallic > 0 or gloss.dielectric > 4 * roughness**4
+
+
+def glossy(scene: Scene) -> tuple[bool, ...]:
+    """Which of a scene's materials are simulated as glossy: those that are worth it, or all where that is forced."""
+    used, forced = set(np.unique(scene.material).tolist()), "gloss" in scene.forced
+    chosen = (
+        (index in used) and (worth_gloss(entry) or (forced and entry.gloss)) for index, entry in enumerate(scene.materials)
+    )
+    return tuple(map(bool, chosen))
+
+
+def glossy_surfaces(tracer: Tracer, scene: Scene) -> Any:
+    """The `ddprt.transport.gloss.Surfaces` of a scene; None, and nothing imported, where no material is simulated as glossy."""
+    return import_module("ddprt.transport.gloss").Surfaces.of(tracer, scene) if any(glossy(scene)) else None
+
+
+def scattering(scene: Scene) -> Scene:
+    """The scene whose albedo is what its surfaces scatter in all directions; the same where none is simulated as glossy."""
+    return import_module("ddprt.transport.gloss").scattering(scene) if any(glossy(scene)) else scene
+
+
+def valid_integrator(asked: str, scene: Scene) -> str:
+    """The cheapest integrator that is valid for a scene's materials, where "auto" is asked for; else the one asked for.
+
+    Raises:
+      UserError: the operator, which takes surfaces as diffuse, for a scene with gloss. Leaving gloss out is the user's to say,
+        so that the plan tells of it.
+    """
+    users = [f'"{entry.name}"' for entry, chosen in zip(scene.materials, glossy(scene), strict=True) if chosen]
+    if users and asked == "operator":
+        raise UserError(
+            f'transport.integrator: got "operator", which takes all surfaces as diffuse, but material {", ".join(users[:3])} '
+            'glosses; expected "auto", "paths" or "reference", or effects.off = ["gloss"]'
+        )
+    return ("paths" if users else "operator") if asked == "auto" else asked
+
+
+_GRAZING = (1.0, 0.84, 0.62, 0.43, 0.29, 0.2, 0.14, 0.1, 0.075, 0.059, 0.049)
+"""Bounds of what facets of no reflectance at normal incidence send back from any direction, by roughness 0, 0.1, ... 1."""
+
+
+def _extremes(gloss: Gloss) -> tuple[float, float]:
+    """Least roughness and largest metallic, textures included."""
+    rough, metal = (1.0, 1.0) if gloss.texture is None else (gloss.texture[..., 0].min(), gloss.texture[..., 1].max())
+    return gloss.roughness * float(rough), gloss.metallic * float(metal)
+
+
+def _lobe_left(scene: Scene, materials: Sequence[Material]) -> float | None:
+    """Bound of the light that lobes of some materials would add, as a share of mean direct irradiance; None if unbounded.
+
+    A lobe sends back at most a share e of what arrives, so light dies away by c + (1 - c) e instead of c, the largest albedo:
+    the sums of both series differ by e / ((1 - c) (1 - e)).
+    """
+    shares = [0.0]
+    for gloss in (material.gloss for material in materials if material.gloss):
+        roughness, metallic = _extremes(gloss)
+        f0 = 1.0 if metallic > 0 else gloss.dielectric
+        shares.append(f0 + (1 - f0) * _GRAZING[int(10 * roughness)])
+    share, albedo = max(shares), max(max(material.albedo) for material in scene.used_materials)
+    return share / ((1 - albedo) * (1 - share)) if max(share, albedo) < 1 else None
+
+
+def _gloss(name: str, question: Question) -> Effect:
+    scene = question.scene
+    rough = [
+        entry
+        for entry, chosen in zip(scene.materials, glossy(scene), strict=True)
+        if entry.gloss and entry in scene.used_materials and not chosen
+    ]
+    left = _lobe_left(scene, rough)
+    users = question.users(worth_gloss)
+    if users:
+        return Effect(name, True, users, left)
+    if rough:
+        return Effect(
+            name, False, f"{question.users(lambda entry: entry.gloss)} too rough: less bright than a white wall", left
+        )
+    return Effect(name, False, "no material has any")
+
+
+def _without_gloss(scene: Scene) -> Scene:
+    return scene.made_of(lambda material: replace(material, gloss=None) if material.gloss else material)
+
+
+def _gloss_left(question: Question) -> float | None:
+    return _lobe_left(question.scene, question.scene.used_materials)
+
+
 EFFECTS: Catalogue[Entry] = Catalogue(
     "effect",
-    {"diffuse bounces": Entry(_diffuse_bounces), **{f"{kind} lights": _light_kind(kind) for kind in LIGHTS}},
+    {
+        "diffuse bounces": Entry(_diffuse_bounces),
+        **{f"{kind} lights": _light_kind(kind) for kind in LIGHTS},
+        "gloss": Entry(_gloss, "gloss", _without_gloss, _gloss_left),
+    },
 )
 
 

@@ -22,6 +22,7 @@ from ddprt.lights import Lighting
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
 from ddprt.transport.direct import centred
+from ddprt.transport.effects import glossy_surfaces
 from ddprt.transport.embree import Tracer
 from ddprt.transport.gather import Receivers
 from ddprt.transport.shading import shade, shift
@@ -63,7 +64,7 @@ def trace_paths(
     """
     receivers = Receivers.texels(atlas, samples, seed, f"{stream} paths", texels)
     lamps = [[(light, shift(light)) for light in centred(tracer, lighting)] for lighting in lightings]
-    albedo = albedo_of(scene)
+    albedo, gloss = albedo_of(scene), glossy_surfaces(tracer, scene)
 
     def work(item: tuple[int, slice]) -> int:
         index, tile = item
@@ -72,9 +73,9 @@ def trace_paths(
             walk, chance = (seeds.stream(seed, name, *address) for name in ("path walk", "path lights"))
             sums = np.zeros((len(lamps), tile.stop - tile.start, 3))
             for start in starts(tracer, receivers, tile):
-                vertices = walked(tracer, albedo, start, walk, bounces)
-                for part in vertices.blocks():
-                    shade(tracer, lamps, part, chance, sums)
+                for met in walked(tracer, albedo, start, walk, bounces, gloss):
+                    for part in met.blocks():
+                        shade(tracer, lamps, part, chance, sums)
             with np.errstate(over="ignore"):  # what is not finite is refused where light is stored
                 out[:, receivers.patch[tile]] = sums / samples
         return tile.stop - tile.start

@@ -10,7 +10,7 @@ from ddprt.compiled import compiled
 from ddprt.lights import Light
 from ddprt.lights.light import Illumination
 from ddprt.transport.embree import Tracer
-from ddprt.transport.walk import Vertices
+from ddprt.transport.walk import Meetings
 
 _FAINT = 2.0  # times the mean of a block: weaker light gets a shadow ray in proportion to its strength
 
@@ -21,7 +21,7 @@ Lamp = tuple[Light, Float32[np.ndarray, "3"]]
 def shade(
     tracer: Tracer,
     lamps: Sequence[Sequence[Lamp]],
-    vertices: Vertices,
+    vertices: Meetings,
     rng: np.random.Generator,
     sums: Float64[np.ndarray, "lightings receivers 3"],
 ) -> None:
@@ -31,7 +31,6 @@ def shade(
     """
     count = len(vertices.owner)
     numbers = rng.random((3, count), np.float32)
-    brightness = vertices.throughput.max(0)
     u = np.empty((2, count), np.float32)
     origins, directions = np.empty((2, count, 3), np.float32)
     reach, weight = np.empty((2, count), np.float32)
@@ -46,11 +45,12 @@ def shade(
             if not any(sample.colour):
                 continue
             there = sample.direction.T, sample.distance, sample.strength
-            chance = brightness, numbers[2], start[2]
+            lit = vertices.lit_from(sample.direction)
+            chance = lit.brightness, numbers[2], start[2]
             rays = _aim(vertices.place, *there, tracer.offset, *chance, weight, target, origins, directions, reach)
             if rays:
                 seen = tracer.unoccluded(origins[:rays], directions[:rays], reach[:rays])
-                _collect(seen, target, weight, vertices.throughput, vertices.owner, sample.colour, total)
+                _collect(seen, target, weight, lit.throughput, lit.owner, sample.colour, total)
 
 
 def shift(light: Light) -> Float32[np.ndarray, "3"]:

@@ -2,7 +2,9 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -14,11 +16,17 @@ from ddprt.transport.direct import BLOCK
 from ddprt.transport.embree import Tracer, lifted
 from ddprt.transport.gather import Receivers
 
-_SURVIVAL = 2.0  # times the throughput: chance to go on. Bounces are cheap beside the shadow rays of all lights
-_MAX_SURVIVAL = 0.999  # a white closed room would never let a path go; a lower cap has no finite variance above its root
+SURVIVAL = 2.0
+"""Times the throughput: chance to go on. Bounces are cheap beside the shadow rays of all lights."""
+
+MAX_SURVIVAL = 0.999
+"""A white closed room would never let a path go; a lower cap has no finite variance above its root."""
 
 Albedo = Callable[[Int32[np.ndarray, " n"], np.ndarray, np.ndarray], Float32[np.ndarray, "n 3"]]
 """Albedo at hits, from triangle (-1 gives anything) and weights of the second and third corner."""
+
+Gloss = Any
+"""What `ddprt.transport.gloss.Surfaces` is; not imported where nothing glosses."""
 
 Rays = tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"], Int32[np.ndarray, " n"]]
 """Origins, directions, and the receiver that each belongs to."""
@@ -38,6 +46,15 @@ class Vertices:
     throughput: Float32[np.ndarray, "3 n"]
     owner: Int32[np.ndarray, " n"]
 
+    @cached_property
+    def brightness(self) -> Float32[np.ndarray, " n"]:
+        """Largest throughput of the channels."""
+        return self.throughput.max(0)
+
+    def lit_from(self, directions: Float32[np.ndarray, "n 3"]) -> "Vertices":
+        """What each W/m² that arrives from directions is worth to the receivers: the same from all."""
+        return self
+
     @classmethod
     def joined(cls, parts: "Sequence[Vertices]") -> "Vertices":
         """One list of many."""
@@ -51,6 +68,28 @@ class Vertices:
             part = slice(low, high)
             place, throughput = (np.ascontiguousarray(values[:, part]) for values in (self.place, self.throughput))
             yield Vertices(place, throughput, self.owner[part])
+
+
+class Meetings(Protocol):
+    """Vertices on surfaces of one kind: what shading asks of them."""
+
+    @property
+    def place(self) -> Float32[np.ndarray, "6 n"]:
+        """As in `Vertices`."""
+        ...
+
+    @property
+    def owner(self) -> Int32[np.ndarray, " n"]:
+        """As in `Vertices`."""
+        ...
+
+    def lit_from(self, directions: Float32[np.ndarray, "n 3"]) -> Vertices:
+        """What each W/m² that arrives from directions is worth to the receivers."""
+        ...
+
+    def blocks(self) -> "Iterator[Meetings]":
+        """Parts of about equal size that fit into a core's cache."""
+        ...
 
 
 def albedo_of(scene: Scene) -> Albedo:
@@ -78,28 +117,38 @@ def starts(tracer: Tracer, receivers: Receivers, tile: slice) -> Iterator[Rays]:
         yield lifted(tracer, positions, frames[:, 2]), warp.to_world(local, frames), owner
 
 
-def walked(tracer: Tracer, albedo: Albedo, rays: Rays, rng: np.random.Generator, bounces: int) -> Vertices:
-    """Follows paths to their ends."""
+def walked(
+    tracer: Tracer, albedo: Albedo, rays: Rays, rng: np.random.Generator, bounces: int, gloss: Gloss | None = None
+) -> "list[Meetings]":
+    """Follows paths to their ends, and lists what they met: diffuse surfaces, and glossy ones where there are any."""
     origins, directions, owner = rays
     throughput = np.ones((3, len(owner)), np.float32)
-    parts = []
+    parts, shiny, met = list[Vertices](), list[Any](), None
     while True:
         triangle, u, v, _ = tracer.first(origins, directions)
+        if gloss:
+            triangle, met = gloss.met(triangle, u, v, directions, throughput, owner)
         place = np.empty((6, len(owner)), np.float32)
         hits = triangle, u, v, directions, albedo(triangle, u, v)
         count = _arrive(*hits, tracer.normals, tracer.corners, tracer.offset, place, throughput, owner)
         place, throughput, owner = place[:, :count], throughput[:, :count], owner[:count]
         parts.append(Vertices(place, throughput, owner))
-        if count == 0 or len(parts) == bounces:
-            return Vertices.joined(parts)
+        shiny += [met] if met else []
+        if (count == 0 and not met) or len(parts) == bounces:
+            break
         throughput, owner, triangle = throughput.copy(), owner.copy(), triangle[:count]
         numbers = rng.random((count, 3), np.float32)
         origins, directions = np.empty((2, count, 3), np.float32)
         count = _go_on(place, numbers, triangle, tracer.frames, throughput, owner, origins, directions)
         throughput, owner = np.ascontiguousarray(throughput[:, :count]), owner[:count].copy()
         origins, directions = origins[:count], directions[:count]
-        if count == 0:
-            return Vertices.joined(parts)
+        if met:
+            more = met.go_on(rng)
+            origins, directions = np.concatenate([origins, more[0]]), np.concatenate([directions, more[1]])
+            throughput, owner = np.concatenate([throughput, more[2]], 1), np.concatenate([owner, more[3]])
+        if len(owner) == 0:
+            break
+    return [Vertices.joined(parts), *([type(shiny[0]).joined(shiny)] if shiny else [])]
 
 
 @compiled
@@ -156,7 +205,7 @@ def _go_on(
     count = 0
     for i in range(len(owner)):
         brightest = max(throughput[0, i], throughput[1, i], throughput[2, i])
-        survival = min(np.float32(_SURVIVAL) * brightest, np.float32(_MAX_SURVIVAL))
+        survival = min(np.float32(SURVIVAL) * brightest, np.float32(MAX_SURVIVAL))
         if not numbers[i, 2] < survival:
             continue
         radius, turn = np.sqrt(numbers[i, 0]), np.float32(2 * np.pi) * numbers[i, 1]
