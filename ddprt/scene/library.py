@@ -171,7 +171,7 @@ def glossy_room(*, roughness: float = 0.25, metallic: float = 1.0, around: int =
     angle = 2 * np.pi * np.arange(around) / around
     rim = np.stack([np.cos(angle), np.zeros(around), np.sin(angle)], 1)
     rings = reach[:, None, None] * rim + (0.24 * height[:, None] * [0.0, 1.0, 0.0])[:, None]
-    vase = np.append(rings.reshape(-1, 3), [[0.0, 0.24, 0.0]], axis=0) + [0.186, 0.0, 0.169]
+    vase = np.append(rings.reshape(-1, 3), [[0.0, 0.24, 0.0]], axis=0) + np.array([0.186, 0.0, 0.169])
     low = (around * np.arange(12)[:, None] + np.arange(around)).ravel()
     after = (around * np.arange(12)[:, None] + (np.arange(around) + 1) % around).ravel()
     top, last = len(vase) - 1, 12 * around + np.arange(around)

@@ -115,7 +115,7 @@ def mean_albedo(roughness: float, f0: float) -> float:
 
 @lru_cache(maxsize=1)
 def _tables() -> tuple[np.ndarray, np.ndarray]:
-    """Albedos of facets, as f0 times the first plus the second, by square root of roughness and fourth root of cosine; their means.
+    """Albedos of facets by roots of roughness and cosine, f0 times the first plus the second; and their means.
 
     The means are those of what is interpolated, so that the diffuse part gives back exactly what the table takes.
     """
