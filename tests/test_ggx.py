@@ -60,7 +60,7 @@ def mirror(tilt: float, turn: float) -> np.ndarray:
 
 
 def sent_back(tilt: float, roughness: float, metallic: float, base: tuple[float, ...] = (1.0, 1.0, 1.0)) -> np.ndarray:
-    """Share of light along a direction that comes back, per channel: an integral over the hemisphere, nothing of the sampler."""
+    """Share of light along a direction that comes back, per channel: an integral over all directions, not by samples."""
     incoming, angle = polar(mirror(tilt, 0.3))
     outgoing = np.tile(directions(tilt, 0.3), (len(incoming), 1))
     value = ggx.evaluate(outgoing, incoming, *of(len(incoming), roughness, metallic, base))

@@ -240,7 +240,7 @@ def valid_integrator(asked: str, scene: Scene) -> str:
     return ("paths" if users else "operator") if asked == "auto" else asked
 
 
-_GRAZING = (1.0, 0.84, 0.62, 0.43, 0.29, 0.2, 0.14, 0.1, 0.075, 0.059, 0.049)
+_GRAZING = (1.0, 0.85, 0.62, 0.43, 0.29, 0.2, 0.14, 0.1, 0.075, 0.06, 0.05)
 """Bounds of what facets of no reflectance at normal incidence send back from any direction, by roughness 0, 0.1, ... 1."""
 
 

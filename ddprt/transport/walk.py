@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -70,6 +70,7 @@ class Vertices:
             yield Vertices(place, throughput, self.owner[part])
 
 
+@runtime_checkable
 class Meetings(Protocol):
     """Vertices on surfaces of one kind: what shading asks of them."""
 
