@@ -224,9 +224,8 @@ class _Bake:
             points = {"points": self._points(listed)} if listed else {}
             self._refuse_other(there, {"counts": _counts(_records(entries)), "lightings": _records(entries), **points})
         with self.progress.stage("atlas") as stage:
-            atlas, hidden = build_open_atlas(
-                self.tracer, scattering(self.scene), self.config.atlas.resolution, self.config.atlas.padding
-            )
+            size = self.config.atlas
+            atlas, hidden = build_open_atlas(self.tracer, scattering(self.scene), size.resolution, size.padding)
             stage.facts |= {"texels": atlas.count, "texels_per_metre": float(f"{atlas.texels_per_metre:.4g}"), **hidden}
         with self.progress.stage("points") as stage:
             samples = listed or self._sunk(self._placed(atlas), lightings)
@@ -237,13 +236,10 @@ class _Bake:
                 stage.facts |= {"train": sum(split == "train" for split, _ in entries), "shadow_rays": shadow_rays}
             lightings = [lighting for _, lighting in entries]
         effects = plan(self.scene, lightings, bounces=self.config.transport.bounces)
-        if (
-            valid_integrator(self.config.transport.integrator, self.scene) != "operator"
-        ):  # the operator tells what it left out, if anything
-            for effect in effects.effects:
-                if effect.bound is None and not effect.forced:
-                    self.progress.warn(f"{effect.name}: {effect.why}")
         description = self._description(entries, effects, drawn, samples)
+        if description["transport"]["integrator"] != "operator":  # which tells what it left out, if anything
+            for effect in (effect for effect in effects.effects if effect.bound is None and not effect.forced):
+                self.progress.warn(f"{effect.name}: {effect.why}")
         if there is None:
             (self.folder / "manifest.jsonl").unlink(missing_ok=True)  # it tells of a dataset that nobody knows any more
             store.write_description(self.folder, description)

@@ -166,6 +166,7 @@ def glossy_room(*, roughness: float = 0.25, metallic: float = 1.0, around: int =
         raise UserError(f"glossy-room.around: got {around}, expected at least 3; a vase is round")
     room = cornell()
     kept = np.r_[0:8, 18:30]  # the short block is five quads after the four walls
+    used, walls = np.unique(room.triangles[kept], return_inverse=True)
     height = np.linspace(0.0, 1.0, 13)
     reach = 0.075 * (0.62 + 0.42 * np.sin(2.3 * np.pi * height**0.8 - 0.35) * (1 - 0.45 * height))
     angle = 2 * np.pi * np.arange(around) / around
@@ -178,10 +179,13 @@ def glossy_room(*, roughness: float = 0.25, metallic: float = 1.0, around: int =
     lid = np.stack([last, np.full(around, top), np.roll(last, -1)], 1)
     faces = np.concatenate([np.stack([low, low + around, after], 1), np.stack([after, low + around, after + around], 1), lid])
     material = Material("gilt", (0.9, 0.65, 0.3), gloss=Gloss(roughness, metallic))
+    positions = np.concatenate([room.positions[used], np.round(vase, 9)])  # sines differ in their last bit among machines
+    triangles = np.concatenate([walls.reshape(-1, 3), faces + len(used)])
     return checked(
         "glossy-room",
-        np.concatenate([room.positions, np.round(vase, 9)]),  # sines differ in their last bit from machine to machine
-        np.concatenate([room.triangles[kept], faces + len(room.positions)]),
+        positions,
+        triangles,
+        normals=vertex_normals(positions, triangles),
         material=np.concatenate([room.material[kept], np.full(len(faces), len(room.materials))]),
         materials=(*room.materials, material),
     )
