@@ -3,9 +3,12 @@
 Exit 0 done, 2 the user can mend it (one line), 1 our fault, 130 interrupted and resumable.
 """
 
+import _thread
 import os
 import shlex
+import signal
 import sys
+import threading
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -17,6 +20,7 @@ from ddprt.progress import Doubt
 from ddprt.verbs import LATER, VERBS, Call
 
 REPORT_ISSUE = "this is our fault: run again with --debug and report what it prints"
+_AGAIN = 0.02  # seconds until a dropped interrupt is asked for again
 FLAGS = {"quiet": "no progress", "debug": "tracebacks instead of one-line errors"}
 
 
@@ -35,7 +39,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     typed = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in typed
     try:
-        with _doubts_in_one_line():
+        with _doubts_in_one_line(), _no_interrupt_lost():
             code = _dispatch([word for word in typed if word != "--debug"])
         sys.stdout.flush()
     except UserError as error:
@@ -86,6 +90,38 @@ def _doubts_in_one_line() -> Iterator[None]:
         warnings.simplefilter("always", Doubt)
         warnings.showwarning = show  # type: ignore[assignment]
         yield
+
+
+@contextmanager
+def _no_interrupt_lost() -> Iterator[None]:
+    """Python drops an interrupt that hits a destructor or a callback of its garbage collector: it is asked for again.
+
+    JAX has such a callback, which runs often enough to be hit: two of four interrupts of a small sweep were lost in it.
+    """
+    as_before = sys.unraisablehook
+
+    def again(dropped: Any) -> None:
+        if not isinstance(dropped.exc_value, KeyboardInterrupt):
+            as_before(dropped)
+            return
+        later = threading.Timer(_AGAIN, _interrupt)  # now, it would be dropped with this hook
+        later.daemon = True
+        later.start()
+
+    sys.unraisablehook = again
+    try:
+        yield
+    finally:
+        sys.unraisablehook = as_before
+
+
+def _interrupt() -> None:
+    """As Ctrl-C does: a signal wakes a main thread that waits for others."""
+    main_thread = threading.main_thread().ident
+    if main_thread is not None and hasattr(signal, "pthread_kill"):  # not on Windows
+        signal.pthread_kill(main_thread, signal.SIGINT)
+    else:
+        _thread.interrupt_main()
 
 
 def _dispatch(words: list[str]) -> int:

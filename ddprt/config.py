@@ -7,6 +7,7 @@ line overrides the file. This module imports no room, so that `ddprt --help` sta
 import hashlib
 import json
 import tomllib
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -60,11 +61,14 @@ class Config(Section):
         if not isinstance(table, dict):
             return table
         knobs = dict(_flat(table))
+        asks = ("bench", "sweep", "budget", "tune", "report")
+        known = [key for key in keys() if key.split(".")[0] not in asks]
         for key, values in knobs.items():
-            if key not in keys() or key.split(".")[0] in ("bench", "sweep", "budget", "tune", "report"):
-                raise ValueError(f"{key}: got {_toml(key)}, expected a setting of a run{nearest(key, keys())}")
+            if key not in known:
+                hint = nearest(key, known) or "; `ddprt bench --help` lists them all"
+                raise ValueError(f"{key}: got {_toml(key)}, expected a setting of a run{hint}")
             if not isinstance(values, list | tuple) or not values:
-                raise ValueError(f"{key}: got {values!r}, expected a list of at least one value; write [{_toml(values)}]")
+                raise ValueError(f"{key}: got {values!r}, expected a list of at least one value; write {_listed(key, values)}")
         return knobs
 
     def to_toml(self) -> str:
@@ -145,8 +149,10 @@ def explain(error: ValidationError, path: str | Path | None, overrides: dict[str
     fault = faults[0]
     key, text = spoken(fault)
     place = [str(part) for part in (*fault["loc"], key) if part != ""]
-    dotted = next((key for n in range(len(place), 0, -1) if (key := ".".join(place[:n])) in keys()), ".".join(place))
-    source = f"--{dotted}" if dotted in overrides else f"{path or 'configuration'}: {dotted}"
+    names = [".".join(place[:n]) for n in range(len(place), 0, -1)]
+    dotted = next((name for name in names if name in keys()), names[0])
+    given = next((name for name in names[: names.index(dotted) + 1] if name in overrides), None)
+    source = f"--{given}" if given else f"{path or 'configuration'}: {names[0] if key else dotted}"
     if fault["type"] == "extra_forbidden":
         siblings = [key for key in keys() if key.split(".")[:-1] == place[:-1]] or keys()
         sections = [*siblings, *(key.split(".")[0] for key in keys())] if len(place) == 1 else siblings
@@ -198,6 +204,15 @@ def _literal(text: str) -> Any:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         return text
+
+
+def _listed(key: str, value: Any) -> str:
+    """How the list is written that a value is the inside or the beginning of; of the default, where there is none."""
+    inner = value.strip("[(,)] ") if isinstance(value, str) else value
+    if isinstance(inner, str | list | tuple) and not inner:
+        return _toml([reduce(getattr, key.split("."), Config())])
+    listed = _literal(f"[{inner}]") if isinstance(inner, str) else [inner]
+    return _toml(listed if isinstance(listed, list) else [inner.strip("'\"")])
 
 
 def _toml(value: Any) -> str:

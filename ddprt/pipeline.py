@@ -163,9 +163,9 @@ class Run:
 
     def budget(self, data: Dataset, models: dict[str, Any]) -> dict[str, Any]:
         """Takes the error of the main model apart, and writes budget.json; its bakes stay in the folder `budget`."""
-        from ddprt.bench.advice import record
-        from ddprt.bench.budget import measure_budget
-        from ddprt.bench.budget_bakes import Bakery
+        from ddprt.bench.budget.advice import record
+        from ddprt.bench.budget.bakes import Bakery
+        from ddprt.bench.budget.budget import measure_budget
 
         bakery = Bakery(self.scene, self.config, data, self.folder / "budget", self.progress)
         model = next(iter(models.values()))
@@ -207,13 +207,13 @@ class Run:
 
     def sweep(self) -> list[Path]:
         """Tries settings about the configuration (`ddprt bench`); returns the results and what shows them."""
-        from ddprt.bench.frontier import sweep
+        from ddprt.bench.frontier.sweep import sweep
 
         return sweep(self.config, self.folder / "bench", self.progress)
 
     def tune(self) -> Any:
-        """Searches a setting within the limits of [tune]; see `ddprt.bench.tune.Outcome`."""
-        from ddprt.bench.tune import tune
+        """Searches a setting within the limits of [tune]; see `ddprt.bench.tune.search.Outcome`."""
+        from ddprt.bench.tune.search import tune
 
         return tune(self.config, self.folder / "tune", self.progress)
 

@@ -98,7 +98,7 @@ def evaluate(call: Call) -> None:
     budget = job.budget(data, models) if call.asks("budget") else None
     report = job.report(data, models, evaluation, budget=budget)
     if budget is not None:
-        from ddprt.bench.budget import table
+        from ddprt.bench.budget.budget import table
 
         print(f"{table(budget)}\nbudget:   {job.folder / 'budget.json'}")
     print(f"metrics:  {job.folder / 'metrics.json'}\nreport:   {report}")
@@ -117,7 +117,7 @@ def bench(call: Call) -> None:
 
 def peers(call: Call) -> None:
     """Our fit, transfer and relighting beside everyone else's."""
-    from ddprt.bench.peers import peers, table
+    from ddprt.bench.peers.peers import peers, table
     from ddprt.config import load_config
     from ddprt.files import make_folder, write_text
     from ddprt.progress import Progress
@@ -136,7 +136,7 @@ def peers(call: Call) -> None:
 
 def tune(call: Call) -> None:
     """find the setting that meets a budget of error, time and bytes, with few trials"""
-    from ddprt.bench.tune import told
+    from ddprt.bench.tune.search import told
 
     call.overrides |= {f"tune.{key.replace('-', '_')}": call.options[key] for key in _LIMITS if key in call.options}
     job = call.run()

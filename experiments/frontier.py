@@ -2,14 +2,15 @@
 
 Question: which share of the memory's bandwidth does a frame reach, how does the fit compare with its peers, what do the cross
           terms of the error budget come to, and how often does `tune` meet a random budget on lightings that it never saw?
-Command:  python experiments/frontier.py [--quick]              all of it; the last line is JSON
-          python experiments/frontier.py tune [SCENE ...]       random budgets alone, ten per scene
+Command:  python experiments/frontier.py [--quick]      all of it; the last line is JSON
+          python experiments/frontier.py tune [SCENE ...] [--minutes 10] [--out runs/frontier]
+                                                        random budgets alone, ten per scene; goes on where it was stopped
 Answer:   docs/frontier.md
 
-The peers are those of `ddprt bench --peers`, cold: models take turns, so that no cache holds a basis. Random budgets are drawn
-about random settings of a grid that is measured as a whole, tighter and looser than these reach. An answer counts as a hit when
-the setting keeps within the limits, its error taken on held-out lightings of another seed; or when `tune` refuses and no
-setting of the grid keeps within them.
+Relighting is cold: models take turns, so that no cache holds a basis. Random budgets are drawn about random settings of a grid
+that is measured as a whole, tighter and looser than these reach. An answer counts as a hit when the setting keeps within the
+limits, its error taken on held-out lightings of another seed; or when `tune` refuses and no setting of the grid keeps within
+them. A search costs what baking and fitting its trials took, the grid what all of its places took.
 """
 
 import json
@@ -17,19 +18,32 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from dataclasses import asdict, replace
+from functools import cached_property
 from itertools import product
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 import ddprt
-from ddprt.bench.peers import Sizes, measure, table
-from ddprt.bench.planner import Place, Trial
-from ddprt.bench.trial import Workshop
-from ddprt.bench.tune import BASES, Search
-from ddprt.bench.yardstick import make_yardstick
+from ddprt.bench.budget.bakes import Bakery
+from ddprt.bench.budget.budget import measure_budget
+from ddprt.bench.measure.settings import Setting
+from ddprt.bench.measure.trial import Workshop, environment, measured_here
+from ddprt.bench.measure.yardstick import make_yardstick
+from ddprt.bench.peers import fit, relight, roofline
+from ddprt.bench.peers.peers import GRAM, Sizes, measure, table
+from ddprt.bench.peers.standing import OURS, Peer, Row, best, compare
+from ddprt.bench.tune.planner import Place, Trial
+from ddprt.bench.tune.search import BASES, Search
 from ddprt.config import Config, checked
+from ddprt.dataset.forecast import forecast
+from ddprt.files import append_line, cache_folder
+from ddprt.machine import instruction_set
 from ddprt.pipeline import Run
 from ddprt.progress import Progress
 from ddprt.runtime.precision import stored
@@ -47,13 +61,28 @@ SCENES: dict[str, dict[str, Any]] = {
     "faults": {},
 }
 LIMITED = ("relative_rmse", "frame_us", "megabytes", "bake_seconds")
+QUICK_FIT = (OURS, "sklearn PCA, covariance_eigh", GRAM)
+QUICK_RELIGHT = (OURS, "numpy B.T @ u.T, into an array")
+QUICK_BASES = (1, 2, 4, 8, 16, 32, 64)  # those that a trial scores anyway, so that no other length is compiled
+GRID: dict[str, tuple[float, ...]] = {
+    "atlas.resolution": (0.5, 1.0),
+    "lightings.train": (0.5, 1.0, 2.0),
+    "transport.target_noise": (0.5, 1.0, 2.0, 4.0, 8.0),  # what differs in noise alone has the same shapes and compiles once
+    "points.count": (0.5, 1.0),
+}
+QUICK_GRID: dict[str, tuple[float, ...]] = {
+    "atlas.resolution": (1.0,),
+    "lightings.train": (0.5, 1.0),
+    "transport.target_noise": (1.0, 2.0, 4.0, 8.0),
+    "points.count": (1.0,),
+}
 
 
-def config(scene: str, resolution: int, train: int, **more: Any) -> Config:
+def config(scene: str, resolution: int, train: int, held_out: int = 32, **more: Any) -> Config:
     document: dict[str, Any] = {
         "scene": {"name": scene},
         "atlas": {"resolution": resolution},
-        "lightings": {"train": train, "validation": 4, "test": 32, **SCENES[scene]},
+        "lightings": {"train": train, "validation": 4, "test": held_out, **SCENES[scene]},
         "points": {"count": 64, "supersample": 4},
         "transport": {"target_noise": 0.02},
         "bench": {"repeats": 1, "path_frames": 0, "pictures": 0, "noise": 0.01},
@@ -62,92 +91,263 @@ def config(scene: str, resolution: int, train: int, **more: Any) -> Config:
     return checked({**document, **more})
 
 
+def quick_peers(base: Config) -> dict[str, float | None]:
+    """The fit of a twentieth of the texels and cold frames, beside the fastest accurate peers of the whole comparison alone."""
+    sizes = Sizes(texels=50_000, repeats=3)
+    with threadpool_limits(limits=roofline.threads()):
+        spectrum = fit.real_spectrum(base, 3 * sizes.lightings, QUIET)
+        maps = fit.Maps(fit.make_columns(spectrum, sizes.texels, base.seed), sizes.bases)
+        fits = compare(_kept(fit.PEERS, QUICK_FIT), maps, repeats=sizes.repeats)
+        show(f"fit of {sizes.bases} bases to {len(spectrum)} columns x {sizes.texels} texels", fits)
+        del maps
+        scenes = cold_scenes(sizes, base.seed)
+        frames = compare(_kept(relight.RELIGHT, QUICK_RELIGHT), scenes, repeats=3 * sizes.repeats)
+        moved = scenes.moved
+        show(f"a frame of {sizes.side} x {sizes.side} texels, {len(scenes.models)} models in turn", frames)
+        del scenes
+        stream = roofline.triad(sizes.bases, 3, repeats=sizes.repeats)
+    ours, first = (next(row for row in frames if row.name == OURS), best(fits))
+    assert ours.seconds is not None
+    fraction = moved / ours.seconds.median / stream.rate
+    print(f"stream {stream.rate / 1e9:.3g} GB/s, a frame {fraction:.1%} of it")
+    return {
+        "relight_bandwidth_fraction": round(fraction, 4),
+        "fit_speedup_best_peer": float(f"{first.ratio:.4g}") if first and first.ratio else None,
+    }
+
+
+def _kept(peers: Sequence[Peer], names: Sequence[str]) -> list[Peer]:
+    """Peers of these names; who is left out is said."""
+    print("left out by --quick:", ", ".join(peer.name for peer in peers if peer.name not in names))
+    return [peer for peer in peers if peer.name in names]
+
+
+def show(what: str, rows: Sequence[Row]) -> None:
+    """A comparison in few lines."""
+    print(what)
+    for row in rows:
+        took = f"{row.ratio:.3g} x ours, {row.seconds.median:.3g} s" if row.seconds and row.ratio else "-"
+        print(f"  {row.name}: {took}, {row.verdict}{f'; {row.reason}' if row.verdict == 'skipped' else ''}", flush=True)
+
+
+def cold_scenes(sizes: Sizes, seed: int) -> relight.Scenes:
+    """As many models as no cache holds: copies of one in memory of their own, which is all that bandwidth asks for."""
+    texels = sizes.side**2
+    first = relight.make_model(texels, sizes.bases, sizes.points, seed)
+    linear = relight.learned(first)
+    count = 1 + -(-roofline.BEYOND * roofline.cache_bytes().bytes // (4 * texels * sizes.bases))
+    copies = [replace(first, relighter=replace(linear, basis=jnp.array(linear.basis, copy=True))) for _ in range(count - 1)]
+    values = np.random.default_rng(seed).random((sizes.points, 3), np.float32)
+    return relight.Scenes([first, *copies], values)
+
+
 def budget_closure(folder: Path, quick: bool) -> float:
     """Sum of the parts' squares over the squared total, of a small Cornell box."""
     more = {"budget": {"lightings": 32 if quick else 128, "abundance": 2 if quick else 4, "noise": 0.01, "turn": False}}
-    job = Run(config("cornell", 32 if quick else 64, 32 if quick else 64, **more), folder, quiet=True)
+    base = config("cornell", 32 if quick else 64, 32 if quick else 64, **more)
+    job = Run(base, folder, quiet=True)
     data = job.bake()
-    models, _ = job.fit(data)
-    document = job.budget(data, models)
-    return float(document["closure"])
+    bakery = Bakery(job.scene, base, data, folder / "budget", QUIET)
+    return measure_budget(fit_config(data, base, "svd-ridge"), bakery).parts.closure
 
 
-def random_budgets(scene: str, folder: Path, count: int, quick: bool) -> dict[str, Any]:
-    """Asks `tune` for budgets, and checks every answer."""
-    base = config(scene, 40 if quick else 64, 32 if quick else 64)
-    factors: dict[str, tuple[float, ...]] = {
-        "atlas.resolution": (1,) if quick else (0.5, 1),
-        "lightings.train": (0.5, 1) if quick else (0.25, 0.5, 1, 2),
-        "transport.target_noise": (1, 4) if quick else (0.5, 1, 2, 4),
-        "points.count": (0.5, 1) if quick else (0.5, 1, 2),
-    }
-    workshop = Workshop(base, folder, QUIET)
-    fresh = make_yardstick(workshop.scene, base.model_copy(update={"seed": 1}), folder / "fresh", QUIET)
-    first = Search(base.model_copy(update={"tune": base.tune.model_copy(update={"max_megabytes": 1.0})}), workshop, factors)
-    known: dict[Place, Trial] = {}
-    for place in product(*first.planner.values):
-        known[place] = first.measure(place)
-    rng = np.random.default_rng(0)
-    hits, trials, spent = 0, 0, 0.0
-    for _ in range(count):
-        like = known[list(known)[rng.integers(len(known))]]
-        at, room = int(rng.integers(len(like.bases))), rng.uniform(0.85, 1.6, len(LIMITED))
-        reached = like.errors[at], like.frame_us[at], like.megabytes["half"][at], like.bake_seconds
-        limits = dict(zip(LIMITED, (np.array(reached) * room).tolist(), strict=True))
-        asked = base.tune.model_copy(update={f"max_{name}": limit for name, limit in limits.items()})
-        search = Search(base.model_copy(update={"tune": asked}), workshop, factors, known.__getitem__)
+class UnfinishedError(Exception):
+    """Time was up; what was measured lies on disk."""
+
+
+class Contest:
+    """Random budgets on one scene.
+
+    Args:
+      scene: of the library.
+      folder: holds bakes, `grid.jsonl` and `answers.jsonl`; what they tell of the same settings, truth, version and machine
+        is not measured again.
+      quick: a grid of eight places, of two shapes, and fewer lightings.
+      until: of `time.perf_counter`, when to stop.
+    """
+
+    def __init__(self, scene: str, folder: Path, quick: bool, until: float = np.inf) -> None:
+        self.scene, self.folder, self.quick, self.until = scene, folder, quick, until
+        self.base = config(scene, 32, 24, held_out=24) if quick else config(scene, 48, 32)
+        self.factors = QUICK_GRID if quick else GRID
+        self.workshop = Workshop(self.base, folder, QUIET)
+        folder.mkdir(parents=True, exist_ok=True)
+        self.key = [Setting({}, self.base).digest, self.workshop.truth]
+
+    @cached_property
+    def expected(self) -> float:
+        """Seconds that the base is forecast to bake, which is the same for all budgets."""
+        return float(forecast(self.workshop.scene, self.base, QUIET).training_seconds)
+
+    def grid(self) -> dict[Place, Trial]:
+        """Every place, measured now or before.
+
+        Raises:
+          UnfinishedError: time is up.
+        """
+        search = self.search({"max_megabytes": 1.0}, None)
+        before = [entry["trial"] for entry in self._told("grid.jsonl")]
+        known = {tuple(trial["place"]): trial_of(trial) for trial in before}
+        places = list(product(*search.planner.values))
+        for place in places:
+            if place in known:
+                continue
+            if time.perf_counter() > self.until:
+                raise UnfinishedError(f"{sum(each in known for each in places)} of {len(places)} places measured")
+            known[place] = search.measure(place)
+            self._tell("grid.jsonl", {"trial": asdict(known[place])})
+        return {place: known[place] for place in places}
+
+    def search(self, limits: dict[str, float], known: dict[Place, Trial] | None) -> Search:
+        asked = self.base.model_copy(update={"tune": self.base.tune.model_copy(update=limits)})
+        expected = self.expected if known else None
+        found = Search(asked, self.workshop, self.factors, known.__getitem__ if known else None, expected)
+        if self.quick:
+            found.bases = found.planner.bases = QUICK_BASES
+        return found
+
+    def answers(self, count: int) -> dict[str, Any]:
+        """Asks `tune` for budgets, and checks every answer.
+
+        Returns:
+          hits, of; trials: bakes of a search, on average; cost_of_grid: share of the grid's seconds that a search takes, on
+          average, and largest; grid: places.
+        Raises:
+          UnfinishedError: time is up.
+        """
+        known = self.grid()
+        unlike = make_yardstick(self.workshop.scene, self.base.model_copy(update={"seed": 1}), self.folder / "fresh", QUIET)
+        cost = sum(map(seconds, known.values()))
+        before = {json.dumps(entry["limits"]): entry for entry in self._told("answers.jsonl")}
+        rng, found = np.random.default_rng(0), []
+        for _ in range(count):
+            like = known[list(known)[rng.integers(len(known))]]
+            at, room = int(rng.integers(len(like.bases))), rng.uniform(0.85, 1.6, len(LIMITED))
+            reached = like.errors[at], like.frame_us[at], like.megabytes["half"][at], like.bake_seconds
+            limits = dict(zip(LIMITED, (np.array(reached) * room).tolist(), strict=True))
+            answer = before.get(json.dumps(limits))
+            if answer is None:
+                if time.perf_counter() > self.until:
+                    raise UnfinishedError(f"{len(found)} of {count} budgets asked")
+                answer = self._answer(limits, known, unlike) | {"limits": limits}
+                self._tell("answers.jsonl", answer)
+            answer |= {"share": answer["seconds"] / cost}
+            told = ", ".join(f"{name} {limit:.3g}" for name, limit in limits.items())
+            print(f"  {self.scene}: {told}: {answer['told']}, {answer['share']:.1%} of the grid's cost", flush=True)
+            found.append(answer)
+        shares = [answer["share"] for answer in found]
+        return {
+            "hits": sum(answer["right"] for answer in found),
+            "of": count,
+            "trials": round(float(np.mean([answer["trials"] for answer in found])), 2),
+            "cost_of_grid": round(float(np.mean(shares)), 4),
+            "largest": round(max(shares), 4),
+            "grid": len(known),
+            "grid_seconds": round(cost, 1),
+        }
+
+    def _answer(self, limits: dict[str, float], known: dict[Place, Trial], unlike: Any) -> dict[str, Any]:
+        search = self.search({f"max_{name}": limit for name, limit in limits.items()}, known)
         outcome = search.run()
-        trials += outcome.trials
-        spent += sum(trial.bake_seconds for trial in search.planner.trials)
         if outcome.met:
-            data, _ = workshop.bake(outcome.setting)
+            data, _ = self.workshop.bake(outcome.setting)
             model = stored(fit_config(data, outcome.setting.config, "svd-ridge"), outcome.plan.precision)
-            error = fresh.tally(model).scores()["relative_rmse"]
+            error = unlike.tally(model).scores()["relative_rmse"]
             right = error is not None and error <= limits["relative_rmse"]
+            what = f"met (a chance of {outcome.chance:.0%}), {error:.3g} on fresh lightings"
         else:
-            right = not any(meets(trial, limits) for trial in known.values())
-        hits += right
-        answer = "met" if outcome.met else f"refused, {outcome.binding} binds"
-        told = ", ".join(f"{name} {limit:.3g}" for name, limit in limits.items())
-        print(f"  {scene}: {told}: {answer} after {outcome.trials} bakes, {'right' if right else 'WRONG'}", flush=True)
-    grid = sum(trial.bake_seconds for trial in known.values())
-    return {"hits": hits, "of": count, "trials": trials / count, "cost_of_grid": spent / count / grid, "grid": len(known)}
+            right = not any(meets(trial, limits, search.bases) for trial in known.values())
+            what = f"refused, {outcome.binding} binds"
+        return {
+            "right": bool(right),
+            "trials": outcome.trials,
+            "seconds": sum(map(seconds, search.planner.trials)),
+            "told": f"{what}, after {outcome.trials} bakes, {'right' if right else 'WRONG'}",
+        }
+
+    def _told(self, name: str) -> list[dict[str, Any]]:
+        path = self.folder / name
+        entries = [json.loads(line) for line in path.read_text("utf-8").splitlines()] if path.is_file() else []
+        return [entry for entry in entries if entry["key"] == self.key and measured_here(entry["environment"])]
+
+    def _tell(self, name: str, entry: dict[str, Any]) -> None:
+        append_line(self.folder / name, json.dumps({"key": self.key, "environment": environment(), **entry}))
 
 
-def meets(trial: Trial, limits: dict[str, float]) -> bool:
-    """Whether any number of bases and precision at a place keeps within all limits."""
+def seconds(trial: Trial) -> float:
+    """What a place costs: its bake, and one fit."""
+    return trial.bake_seconds + trial.fit_seconds
+
+
+def trial_of(plain: dict[str, Any]) -> Trial:
+    """A trial as JSON gives it back."""
+    tuples = {name: tuple(value) for name, value in plain.items() if isinstance(value, list)}
+    return Trial(**{**plain, **tuples, "megabytes": {name: tuple(row) for name, row in plain["megabytes"].items()}})
+
+
+def meets(trial: Trial, limits: dict[str, float], offered: Sequence[int] = BASES) -> bool:
+    """Whether any offered number of bases, in any precision, keeps within all limits at a place."""
     if trial.bake_seconds > limits["bake_seconds"]:
         return False
     curves = np.log(np.array([trial.errors, trial.frame_us, *trial.megabytes.values()]))
-    wanted = [bases for bases in BASES if bases <= trial.bases[-1]]
+    wanted = [bases for bases in offered if bases <= trial.bases[-1]]
     error, frame, *sizes = (np.exp(np.interp(np.log(wanted), np.log(trial.bases), curve)) for curve in curves)
     fine = (error <= limits["relative_rmse"]) & (frame <= limits["frame_us"])
     return bool(any((fine & (size <= limits["megabytes"])).any() for size in sizes))
 
 
-def main(words: Sequence[str]) -> None:
+def keep_compiled() -> None:
+    """Lets JAX keep what it compiles for the next run, where the commands of ddprt keep theirs."""
+    jax.config.update("jax_compilation_cache_dir", str(cache_folder() / f"jax-{instruction_set()}"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+
+
+def clock(begun: float) -> str:
+    """How long it has been; the processors' time tells a busy machine from a slow program."""
+    return f"after {time.perf_counter() - begun:.1f} s, {time.process_time():.1f} s of processors"
+
+
+def tune(words: Sequence[str]) -> int:
+    """Random budgets on scenes; how many could not be ended in time."""
+    options = {word: words[at + 1] for at, word in enumerate(words) if word in ("--minutes", "--out")}
+    values = set(options.values())
+    chosen = [word for word in words if not word.startswith("--") and word not in values] or list(SCENES)
+    left = 0
+    for scene in chosen:
+        until = time.perf_counter() + 60 * float(options.get("--minutes", 10))
+        contest = Contest(scene, Path(options.get("--out", "runs/frontier")) / scene, "--quick" in words, until)
+        try:
+            print(f"{scene}: {json.dumps(contest.answers(10))}", flush=True)
+        except UnfinishedError as told:
+            print(f"{scene}: {told}, time is up; the same command goes on from here", flush=True)
+            left += 1
+    return left
+
+
+def main(words: Sequence[str]) -> int:
+    keep_compiled()
+    if words[:1] == ["tune"]:
+        return tune(words[1:])
     quick, begun = "--quick" in words, time.perf_counter()
-    names = [word for word in words if not word.startswith("--")]
     with tempfile.TemporaryDirectory(prefix="frontier-") as scratch:
         folder = Path(scratch)
-        if names[:1] == ["tune"]:
-            chosen = names[1:] or list(SCENES)
-            for scene in chosen:
-                print(f"{scene}: {random_budgets(scene, folder / scene, 10, quick)}", flush=True)
-            return
-        sizes = Sizes(texels=50_000, repeats=2, limit=1, product=1024, disk=64 << 20) if quick else Sizes()
-        record = measure(config("cornell", 48, 32), QUIET, sizes)
-        print(table(record))
-        summary = record["summary"]
-        found: dict[str, Any] = {key: summary[key] for key in ("relight_bandwidth_fraction", "fit_speedup_best_peer")}
-        print(f"after {time.perf_counter() - begun:.0f} s", flush=True)
+        base = config("cornell", 48, 32)
+        if quick:
+            found: dict[str, Any] = quick_peers(base)
+        else:
+            record = measure(base, QUIET, Sizes())
+            print(table(record))
+            found = {key: record["summary"][key] for key in ("relight_bandwidth_fraction", "fit_speedup_best_peer")}
+        print(f"peers: {clock(begun)}", flush=True)
         found["budget_closure"] = round(budget_closure(folder / "budget", quick), 4)
-        print(f"budget closes to {found['budget_closure']}, after {time.perf_counter() - begun:.0f} s", flush=True)
-        tuned = random_budgets("cornell", folder / "tune", 10, quick)
-        print(f"tune: {tuned}, after {time.perf_counter() - begun:.0f} s")
+        print(f"budget closes to {found['budget_closure']}: {clock(begun)}", flush=True)
+        tuned = Contest("cornell", folder / "tune", quick).answers(10)
+        print(f"tune: {tuned}: {clock(begun)}")
         found |= {"tune_hits": tuned["hits"] / tuned["of"], "tune_trials": tuned["trials"]}
+        found |= {"tune_cost_of_grid": tuned["cost_of_grid"], "tune_grid": tuned["grid"]}
         print(json.dumps(found | {"ddprt": ddprt.__version__, "seconds": round(time.perf_counter() - begun, 1)}))
+    return 0
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(main(sys.argv[1:]))

@@ -29,7 +29,7 @@ from paper_figures import POINTS, SCENES
 
 import ddprt
 from ddprt import seeds
-from ddprt.bench.timing import Timing, timed
+from ddprt.bench.measure.timing import Timing, timed
 from ddprt.config import load_config
 from ddprt.dataset.store import Dataset
 from ddprt.fitting.encoding import Encoding

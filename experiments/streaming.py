@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ddprt.bench.timing import peak_memory
+from ddprt.bench.measure.timing import peak_memory
 from ddprt.dataset.pack import Pack
 from ddprt.fitting.basis import entry_weights, fit_basis
 from ddprt.fitting.encoding import Encoding

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ddprt.bench import best_fit
-from ddprt.bench.advice import record, turn, weigh_knobs
-from ddprt.bench.best_fit import best_transfer, projected, same_fit
-from ddprt.bench.budget import CAUSES, Budget, measure_budget, table
-from ddprt.bench.budget_bakes import Bakery
-from ddprt.bench.chain import Link, squared_error, take_apart
+from ddprt.bench.budget import best_fit
+from ddprt.bench.budget.advice import record, turn, weigh_knobs
+from ddprt.bench.budget.bakes import Bakery
+from ddprt.bench.budget.best_fit import best_transfer, projected, same_fit
+from ddprt.bench.budget.budget import CAUSES, Budget, measure_budget, table
+from ddprt.bench.budget.chain import Link, squared_error, take_apart
 from ddprt.config import load_config
 from ddprt.errors import UserError
 from ddprt.export.textures import LAYER, export_textures
@@ -93,7 +93,7 @@ def moved(before: Budget, after: Budget) -> set[str]:
 
 def test_parts_and_cross_terms_are_the_error(workshop: Workshop) -> None:
     budget, model, bakery = workshop()
-    from ddprt.bench.budget import engine_values
+    from ddprt.bench.budget.budget import engine_values
 
     engine, _ = engine_values(model, budget.lightings, bakery.config.budget)
     ships = np.maximum(stored(model, "half").predict(engine, clamp=False), 0).astype(np.float64)

@@ -1,9 +1,12 @@
 """The command line: exit codes, one-line errors, files where they are promised."""
 
+import gc
 import json
 import os
+import signal
 import subprocess
 import sys
+import threading
 import time
 import tomllib
 from dataclasses import replace
@@ -465,3 +468,37 @@ def test_an_error_that_an_interrupt_makes_is_an_interrupt(monkeypatch: pytest.Mo
             main(["doctor"])
         assert end.value.code == code
         assert words in capsys.readouterr().err
+
+
+def test_an_interrupt_that_a_callback_drops_comes_again(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    """Python ignores what a callback of its garbage collector raises; other errors there stay what they were."""
+    ignored: list[Any] = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda dropped: ignored.append(dropped.exc_type))
+    raised: list[type[BaseException]] = [KeyboardInterrupt, ValueError]
+
+    def callback(phase: str, info: dict[str, int]) -> None:
+        if raised:
+            raise raised.pop()
+
+    def work(call: Any) -> None:
+        gc.callbacks.append(callback)
+        try:
+            gc.collect()
+            assert not raised
+            threading.Event().wait(5)  # a wait that only a signal ends early
+            raise AssertionError("no interrupt came")
+        finally:
+            gc.callbacks.remove(callback)
+
+    monkeypatch.setitem(VERBS, "doctor", replace(VERBS["doctor"], work=work))
+    as_before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a runner of tests may ignore it
+    begun = time.perf_counter()
+    try:
+        with pytest.raises(SystemExit) as end:
+            main(["doctor"])
+    finally:
+        signal.signal(signal.SIGINT, as_before)
+    assert end.value.code == 130
+    assert time.perf_counter() - begun < 4, "the wait was woken"
+    assert "goes on from there" in capsys.readouterr().err
+    assert ignored == [ValueError]

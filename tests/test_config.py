@@ -93,6 +93,14 @@ FAULTS = {
     "unknown override": ("", {"fit.basis": "3"}, ["--fit.basis", 'did you mean "fit.bases"?']),
     "bad override": ("", {"fit.bases": "x"}, ["--fit.bases", "got 'x'", "integer"]),
     "override below a value": ("fit = 3\n", {"fit.bases": "3"}, ["--fit.bases"]),
+    "a knob of a sweep, by its own name": (
+        "[sweep]\nfit.bases = 4\n",
+        {},
+        ["job.toml: sweep.fit.bases: got 4, expected a list", "; write [4]"],
+    ),
+    "a knob on the command line": ("", {"sweep.fit.bases": "[]"}, ["--sweep.fit.bases: got [], ", "write [16]"]),
+    "a knob that measures, not makes": ("", {"sweep.bench.repeats": "[1]"}, ["--sweep.bench.repeats: got", "; `ddprt bench"]),
+    "a knob that nothing is like": ("[sweep]\nzzzz = [1]\n", {}, ["sweep.zzzz: got", "; `ddprt bench --help` lists"]),
     "seed out of range": ("seed = -1\n", {}, ["seed", "got -1"]),
 }
 

@@ -6,47 +6,22 @@ import signal
 import subprocess
 import sys
 import time
-import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from small_job import SMALL, base, call
 
-from ddprt.bench import trial
-from ddprt.bench.frontier import RESULTS, read_results, sweep
-from ddprt.bench.settings import settings_of
-from ddprt.bench.trial import Workshop
-from ddprt.cli import main
-from ddprt.config import Config, checked
+from ddprt.bench.frontier.sweep import RESULTS, read_results, sweep
+from ddprt.bench.measure import trial
+from ddprt.bench.measure.settings import settings_of
+from ddprt.bench.measure.trial import Workshop
+from ddprt.config import Config
 from ddprt.errors import UserError
 from ddprt.files import alone_in
 from ddprt.progress import Progress
 
-SMALL = """
-[atlas]
-resolution = 32
-[lightings]
-train = 8
-validation = 2
-test = 3
-[points]
-count = 12
-supersample = 2
-[transport]
-samples = 8
-threads = 2
-[fit]
-bases = 4
-[methods.settings.mlp]
-steps = 5
-width = 8
-[bench]
-repeats = 1
-path_frames = 0
-pictures = 0
-noise = 0.3
-"""
 SWEEP = {
     "fit.bases": (2, 400),
     "fit.method": ("mlp", "nearest"),
@@ -58,21 +33,8 @@ SWEEP = {
 FAIL = {"points.count", "scene.name"}
 
 
-def base(**sections: Any) -> Config:
-    document = tomllib.loads(SMALL)
-    for section, values in sections.items():
-        document[section] = {**document.get(section, {}), **values}
-    return checked(document)
-
-
 def quiet(config: Config, folder: Path) -> list[Path]:
     return sweep(config, folder, Progress(quiet=True))
-
-
-def call(*words: object) -> int:
-    with pytest.raises(SystemExit) as stop:
-        main([str(word) for word in words])
-    return int(stop.value.code or 0)
 
 
 @pytest.fixture(scope="module")
@@ -155,7 +117,7 @@ def test_equal_datasets_are_baked_once_and_go_afterwards(swept: tuple[Path, list
 
 
 def test_kept_datasets_stay(tmp_path: Path) -> None:
-    config = base(sweep={"fit.bases": (2,)}, bench={"keep": True})
+    config = base(sweep={"fit.bases": (2,)}, bench__keep=True)
     quiet(config, tmp_path)
     assert [path.name for path in (tmp_path / "datasets").iterdir()] == [settings_of(config)[0].bake_digest]
 
@@ -298,11 +260,14 @@ def test_the_command_line_sweeps(tmp_path: Path, capsys: pytest.CaptureFixture[s
     ("words", "message"),
     [
         (["--quick"], "--quick: got no --peers"),
-        (["--sweep.fit.bases", "4"], "got 4, expected a list of at least one value; write [4]"),
-        (["--sweep.fit.bases", "[]"], "expected a list of at least one value"),
+        (["--sweep.fit.bases", "4"], "--sweep.fit.bases: got 4, expected a list of at least one value; write [4]"),
+        (["--sweep.fit.bases", "[4,"], "--sweep.fit.bases: got '[4,', expected a list of at least one value; write [4]"),
+        (["--sweep.fit.bases", "4, 8]"], "got '4, 8]', expected a list of at least one value; write [4, 8]"),
+        (["--sweep.fit.bases", "[]"], "--sweep.fit.bases: got [], expected a list of at least one value; write [16]"),
+        (["--sweep.fit.bases", "["], "got '[', expected a list of at least one value; write [16]"),
+        (["--sweep.fit.method", "['mlp"], 'expected a list of at least one value; write ["mlp"]'),
         (["--sweep.fit.bases", "['x']"], "fit.bases: got 'x', expected integer"),
         (["--sweep.fit.basis", "[4]"], 'got "fit.basis", expected a setting of a run; did you mean "fit.bases"?'),
-        (["--sweep.bench.repeats", "[4]"], "expected a setting of a run"),
         (["--bench.repeats", "0"], "--bench.repeats: got 0"),
         (["--bench.combine", "all"], "--bench.combine: got"),
         (["--bench.combine", "grid"], "[sweep]: got a grid of"),
@@ -330,19 +295,19 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path, capsys: pytest.Cap
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "sections",
+    "changes",
     [
-        {"scene": {"name": "furnace", "parameters": {"subdivisions": 2}}},
-        {"scene": {"name": "statue", "parameters": {"subdivisions": 2}}, "lightings": {"distribution": "around"}},
-        {"scene": {"name": "corridor"}},
-        {"lightings": {"choose": "active"}, "points": {"choose": "qr"}},
-        {"transport": {"integrator": "reference"}, "bench": {"path_frames": 6}},
-        {"transport": {"integrator": "paths"}},
+        {"scene__name": "furnace", "scene__parameters": {"subdivisions": 2}},
+        {"scene__name": "statue", "scene__parameters": {"subdivisions": 2}, "lightings__distribution": "around"},
+        {"scene__name": "corridor"},
+        {"lightings__choose": "active", "points__choose": "qr"},
+        {"transport__integrator": "reference", "bench__path_frames": 6},
+        {"transport__integrator": "paths"},
     ],
     ids=["furnace", "statue", "corridor", "chosen", "reference", "paths"],
 )
-def test_other_scenes_and_ways_are_swept(sections: dict[str, Any], tmp_path: Path) -> None:
-    quiet(base(**sections, sweep={"fit.bases": (2,)}), tmp_path)
+def test_other_scenes_and_ways_are_swept(changes: dict[str, Any], tmp_path: Path) -> None:
+    quiet(base(**changes, sweep={"fit.bases": (2,)}), tmp_path)
     for record in read_results(tmp_path / RESULTS).values():
         assert not record["failed"]
         # A few noisy maps may do worse than black, which has about 1; a scale that is off by the lamps' would have far more.
@@ -358,8 +323,8 @@ def test_listed_lightings_are_swept_and_a_changed_list_is_measured_anew(tmp_path
         lamps = [[{"type": "point", "position": place, "intensity": [strength] * 3}] for place in places]
         listed.write_text(json.dumps(lamps))
 
-    counts = {"file": str(listed), "train": 4, "validation": 1, "test": 2}
-    config = base(lightings=counts, sweep={"fit.bases": (2,), "lightings.train": (5,)})
+    counts = {"lightings__file": str(listed), "lightings__train": 4, "lightings__validation": 1, "lightings__test": 2}
+    config = base(**counts, sweep={"fit.bases": (2,), "lightings.train": (5,)})
     for strength in (1.0, 2.0):
         write(strength)
         quiet(config, tmp_path / "run")

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_bench_page import example, examples, failure
+from made_up_sweep import example, examples, failure
 
-from ddprt.bench.pareto import COSTS, DRAWN, ERRORS, Measure, flat, front, knee, latest, path, slopes, write_csv
+from ddprt.bench.frontier.pareto import COSTS, DRAWN, ERRORS, Measure, flat, front, knee, latest, path, slopes, write_csv
 from ddprt.errors import UserError
 
 EPS = float(np.finfo(np.float64).eps)

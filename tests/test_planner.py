@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ddprt.bench.planner import KNOBS, Law, Place, Plan, Planner, Trial
+from ddprt.bench.tune.planner import KNOBS, Law, Place, Plan, Planner, Trial
 
 BASE: Place = (256.0, 128.0, 0.01, 128.0)
 VALUES = ((64.0, 128.0, 181.0, 256.0), (16.0, 32.0, 64.0, 128.0, 256.0), (0.005, 0.01, 0.02, 0.04), (64.0, 128.0, 256.0))
@@ -129,6 +129,20 @@ def test_a_tried_place_is_told_as_it_was_measured() -> None:
         plan = Plan(place, bases, precision)
         for name, value in measured(world(place), plan).items():
             assert np.exp(planner.guesses(plan)[name].mean) == pytest.approx(value, rel=1e-9), name
+
+
+def test_where_all_else_is_barred_the_place_that_was_tried_is_the_answer() -> None:
+    """Also on a budget that it is far from: there is nothing else to propose."""
+    planner = Planner(BASE, VALUES, BASES, ("half", "float"), {"relative_rmse": 0.02})
+    planner.add(world(BASE))
+    assert planner.next()[0].place != BASE
+    planner.barred = {*product(*VALUES)} - {BASE}
+    plan, chance = planner.next()
+    assert plan == Plan(BASE, 128, "half"), "as near as it comes"
+    assert chance < 1e-6, "its error is half as much again, which is known to a twentieth"
+    still = Planner(BASE, [(value,) for value in BASE], BASES, ("half", "float"), planner.limits)
+    still.add(world(BASE))
+    assert still.next() == (plan, chance), "no knob can be turned"
 
 
 def test_knobs_and_places_are_of_one_length() -> None:

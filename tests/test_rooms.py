@@ -29,6 +29,8 @@ WALK = [
     "verbs",
     "cli",
 ]
+BENCH = {"measure": [], "budget": [], "frontier": ["measure"], "tune": ["measure"], "peers": ["measure"]}
+"""The parts of that room, and which other parts each may import."""
 FILES = sorted(PACKAGE.rglob("*.py"))
 NUMPY_ROOMS = {"scene", "lights", "sampling", "transport", "dataset", "export", *GROUND, "config"}
 
@@ -67,6 +69,18 @@ def test_nothing_imports_to_its_right(path: Path) -> None:
         assert target in WALK, f"{path}: imports {module}, which is in no room"
         assert here not in GROUND, f"{path}: the ground imports {module}"
         assert WALK.index(target) <= WALK.index(here), f"{path}: {here} imports {module}, which lies to its right"
+
+
+@pytest.mark.parametrize("part", sorted({path.parts[-2] for path in FILES if path.parts[-3] == "bench"}))
+def test_parts_of_the_bench_know_only_what_measures(part: str) -> None:
+    for path in (PACKAGE / "bench" / part).glob("*.py"):
+        found = [module.split(".")[2:] for module in imports(path) if module.startswith("ddprt.bench")]
+        assert all(found), f"{path}: imports from ddprt.bench, expected one of its parts"
+        assert {names[0] for names in found} <= {part, *BENCH[part]}, path
+
+
+def test_modules_of_the_bench_stand_in_its_parts() -> None:
+    assert [path.name for path in (PACKAGE / "bench").glob("*.py")] == ["__init__.py"]
 
 
 def doors(library: str) -> set[str]:

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from ddprt.bench.settings import Setting, changed, plan_of, settings_of
+from ddprt.bench.measure.settings import Setting, changed, plan_of, settings_of
 from ddprt.config import Config, checked, load_config
 from ddprt.errors import UserError
 
@@ -78,14 +78,16 @@ def test_names_and_files_round_trip(tmp_path: Any) -> None:
 
 def test_command_lines_sweep_too() -> None:
     assert load_config(None, {"sweep.fit.bases": "[4, 8]"}).sweep == {"fit.bases": (4, 8)}
+    with pytest.raises(UserError, match=r"--sweep: got 4, expected a list"):
+        load_config(None, {"sweep": "{fit.bases = 4}"})
 
 
 @pytest.mark.parametrize(
     ("sweep", "message"),
     [
         ({"fit.base": [1]}, 'got "fit.base", expected a setting of a run; did you mean "fit.bases"'),
-        ({"fit.bases": 3}, r"got 3, expected a list of at least one value; write \[3\]"),
-        ({"fit.bases": []}, "expected a list of at least one value"),
+        ({"fit.bases": 3}, r"sweep.fit.bases: got 3, expected a list of at least one value; write \[3\]"),
+        ({"fit.bases": []}, r"expected a list of at least one value; write \[16\]"),
         ({"bench.repeats": [3]}, "expected a setting of a run"),
         ({"sweep": [3]}, "expected a setting of a run"),
     ],

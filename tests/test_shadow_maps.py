@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ddprt.bench.shadow_maps import ShadowMap, engine_irradiance
+from ddprt.bench.budget.shadow_maps import ShadowMap, engine_irradiance
 from ddprt.lights import parse_lighting
 from ddprt.scene.mesh import Scene
 from ddprt.transport.embree import Tracer

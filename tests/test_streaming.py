@@ -273,7 +273,7 @@ from ddprt import cli
 assert "jax" not in sys.modules
 cli._keep_compiled()
 assert "jax" not in sys.modules
-from ddprt.bench.timing import compiling
+from ddprt.bench.measure.timing import compiling
 import jax, jax.numpy as jnp
 with compiling() as spent:
     x = jax.block_until_ready(jax.jit(lambda x: jnp.linalg.svd(jnp.sin(x) @ x.T + jnp.cumsum(x, 1))[1])(jnp.ones((9, 9))))

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 import ddprt
-from ddprt.bench import pareto, trial
-from ddprt.bench.settings import Setting, changed
-from ddprt.bench.trial import Workshop, frame_seconds, measured_here
+from ddprt.bench.frontier import pareto
+from ddprt.bench.measure import trial
+from ddprt.bench.measure.settings import Setting, changed
+from ddprt.bench.measure.trial import Workshop, frame_seconds, measured_here
 from ddprt.config import Config, checked
 from ddprt.dataset.splits import SPLITS
 from ddprt.dataset.store import Dataset

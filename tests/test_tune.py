@@ -1,7 +1,6 @@
 """The search for a setting within a budget: on real small bakes, and its pure parts against what they are short for."""
 
 import json
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,16 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from small_job import SMALL, base, call
 
 import ddprt
-from ddprt.bench import trial as trials
-from ddprt.bench import tune as tuning
-from ddprt.bench.planner import KNOBS, QUANTITIES, Plan, Trial
-from ddprt.bench.settings import Setting, changed
-from ddprt.bench.trial import Workshop
-from ddprt.bench.tune import FACTORS, Outcome, Search, _around, first_bases, spread_of, told, tune, with_measured
-from ddprt.cli import main
-from ddprt.config import Config, checked, load_config
+from ddprt.bench.measure import trial as trials
+from ddprt.bench.measure.settings import Setting, changed
+from ddprt.bench.measure.trial import Workshop
+from ddprt.bench.tune import search as tuning
+from ddprt.bench.tune.planner import KNOBS, QUANTITIES, Plan, Trial
+from ddprt.bench.tune.search import FACTORS, Outcome, Search, _around, first_bases, spread_of, told, tune, with_measured
+from ddprt.config import Config, load_config
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.files import alone_in
@@ -27,46 +26,15 @@ from ddprt.report.metrics import Tally
 from ddprt.runtime.precision import shipped_bytes, stored
 from ddprt.runtime.train import fit_config
 
-SMALL = """
-[atlas]
-resolution = 32
-[lightings]
-train = 8
-validation = 2
-test = 4
-[points]
-count = 12
-supersample = 2
-[transport]
-samples = 8
-threads = 2
-[fit]
-bases = 4
-[bench]
-repeats = 1
-path_frames = 0
-pictures = 0
-noise = 0.3
-keep = true
-"""
 QUIET = Progress(quiet=True)
-
-
-def base(**changes: Any) -> Config:
-    return changed(checked(tomllib.loads(SMALL)), {key.replace("__", "."): value for key, value in changes.items()})
-
-
-def call(*words: object) -> int:
-    with pytest.raises(SystemExit) as stop:
-        main([str(word) for word in words])
-    return int(stop.value.code or 0)
+ROOMY = {"tune__max_relative_rmse": 0.9, "tune__max_megabytes": 5.0, "bench__keep": True}
 
 
 @pytest.fixture(scope="module")
 def tuned(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
     """A search that a budget with room ends at once, and whose datasets stay."""
     folder = tmp_path_factory.mktemp("tune")
-    return folder, tune(base(tune__max_relative_rmse=0.9, tune__max_megabytes=5.0), folder, QUIET)
+    return folder, tune(base(**ROOMY), folder, QUIET)
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +92,7 @@ def test_a_search_that_was_stopped_bakes_nothing_again(tuned: tuple[Path, Outcom
         raise AssertionError("baked again")
 
     monkeypatch.setattr(trials, "bake", forbidden)
-    after = tune(base(tune__max_relative_rmse=0.9, tune__max_megabytes=5.0), folder, QUIET)
+    after = tune(base(**ROOMY), folder, QUIET)
     assert after.reached["relative_rmse"] == before.reached["relative_rmse"]
     assert after.reached["bake_seconds"] == before.reached["bake_seconds"]
     assert len((folder / "trials.jsonl").read_text().splitlines()) == 1, "those of the search before are not mixed in"
@@ -132,7 +100,7 @@ def test_a_search_that_was_stopped_bakes_nothing_again(tuned: tuple[Path, Outcom
 
 def test_what_cannot_be_met_is_one_line_and_a_configuration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     job, folder = tmp_path / "job.toml", tmp_path / "run" / "tune"
-    job.write_text(SMALL.replace("keep = true", ""))
+    job.write_text(SMALL)
     words = ["--out", tmp_path / "run", "--max-relative-rmse", "1e-4", "--max-frame-us", "1e9", "--tune.trials", "1", "--quiet"]
     folder.mkdir(parents=True)
     (folder / "tuned.toml").write_text("of an earlier budget")

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-import ddprt.bench.yardstick as module
-from ddprt.bench.yardstick import Yardstick, carrier, make_yardstick
+import ddprt.bench.measure.yardstick as module
+from ddprt.bench.measure.yardstick import Yardstick, carrier, make_yardstick
 from ddprt.config import Config, load_config
 from ddprt.dataset.generate import bake
 from ddprt.dataset.store import Dataset
@@ -99,7 +99,7 @@ def test_the_second_time_it_is_there(cornell: Scene, folder: Path, yardstick: Ya
         ({"transport__integrator": "paths"}, {"integrator": "paths", "test_samples": "auto"}),
         ({"transport__integrator": "reference"}, {"integrator": "reference", "test_samples": 32}),
         ({"atlas__resolution": "64"}, {"resolution": 64}),
-        ({"lightings__choose": "active"}, {}),
+        ({"lightings__choose": "active", "lightings__target_error": "0.1"}, {"choose": "random", "target_error": 0}),
         ({"bench__path_frames": "0"}, {"test": 4}),
     ],
 )
@@ -107,7 +107,8 @@ def test_what_is_baked(
     cornell: Scene, data: Dataset, monkeypatch: pytest.MonkeyPatch, changes: dict[str, str], expected: dict[str, Any]
 ) -> None:
     def stub(scene: Scene, splits: dict[str, Any], *, config: Config, out: Path, progress: Any) -> Dataset:
-        told.update(config.transport.model_dump() | config.atlas.model_dump() | {"test": len(splits["test"])}, splits=splits)
+        sections = config.lightings.model_dump() | config.transport.model_dump() | config.atlas.model_dump()
+        told.update(sections | {"test": len(splits["test"])}, splits=splits)
         return data
 
     told: dict[str, Any] = {}

@@ -35,6 +35,12 @@ def map_name(kind: str, index: int) -> str:
     return f"{kind}/{index:06d}.{'safetensors' if kind == 'measured' else 'exr'}"
 
 
+def layer_name(layer: str, index: int | str, kind: str = "light") -> str:
+    """Relative path of a lighting's coefficients in a layer, or of its "places"; kind is "light" or "noise"."""
+    stem = index if isinstance(index, str) else f"{index:06d}{'' if kind == 'light' else f'.{kind}'}"
+    return f"{layer}/{stem}.safetensors"
+
+
 @dataclass(frozen=True, eq=False)
 class Dataset:
     """A baked (or imported) dataset, read on demand; make one with `ddprt.bake` or `ddprt.open_dataset`.
@@ -219,6 +225,10 @@ def expected_files(description: dict[str, Any]) -> list[str]:
     for index, entry in enumerate(description["lightings"]):
         kinds = ["direct", "measured", "indirect", *(["noise"] if entry["split"] == "test" else [])]
         names += [map_name(kind, index) for kind in kinds]
+    for layer in (entry["name"] for entry in description.get("layers", [])):
+        names.append(layer_name(layer, "places"))
+        for index, entry in enumerate(description["lightings"]):
+            names += [layer_name(layer, index, kind) for kind in ("light", "noise")[: 1 + (entry["split"] == "test")]]
     return names
 
 

@@ -69,6 +69,7 @@ class Examples:
       weights: share of each texel in errors, summing to 1.
       channels: "mono" or "multi": whether colours are separate columns.
       unseen: share of the indirect light's squares that lies in lightings no point sees; encoding makes them black.
+      signed: entries may be negative, as coefficients of harmonics are.
     """
 
     frame: Frame
@@ -78,6 +79,7 @@ class Examples:
     weights: str = "area"
     channels: str = "mono"
     unseen: float = 0.0
+    signed: bool = False
 
 
 @dataclass(frozen=True)

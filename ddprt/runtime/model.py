@@ -1,7 +1,7 @@
 """A Model: a Relighter with everything that an engine needs around it."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ddprt.dataset.layers import Layer
 from ddprt.dataset.store import average_into_points
 from ddprt.errors import UserError
 from ddprt.fitting.encoding import Encoding
@@ -41,6 +42,7 @@ class Model:
       scene: name and digest of what it was trained on.
       uv: lightmap coordinates of the occluders' corners, origin top-left; None in models of older versions.
       yardstick: what trust is measured with; None likewise.
+      layers: what answers for light besides the lightmap, by name of the layer.
     """
 
     method: str
@@ -55,6 +57,7 @@ class Model:
     scene: dict[str, str]
     uv: np.ndarray | None = None
     yardstick: Yardstick | None = None
+    layers: "Mapping[str, LayerModel]" = field(default_factory=dict)
 
     def predict(self, values: Any, *, clamp: bool | str = True, fade: bool = False) -> np.ndarray:
         """Indirect irradiance from measured light.
@@ -195,6 +198,36 @@ class Model:
         from ddprt.transport.embree import Tracer
 
         return Tracer(self.occluders)
+
+
+@dataclass(frozen=True, eq=False)
+class LayerModel:
+    """What answers for a layer: the same measurements, a basis and a transfer of its own.
+
+    Attributes:
+      layer: where its functions are.
+      model: its texels are coefficients, places down and harmonics across.
+    """
+
+    layer: Layer
+    model: Model
+
+    def predict(self, values: Any) -> np.ndarray:
+        """Harmonics from measured light.
+
+        Args:
+          values: as for `Model.predict`.
+        Returns:
+          (places, coefficients, 3) or (frames, places, coefficients, 3) float32, in the layer's quantity.
+        Raises:
+          UserError: likewise.
+        """
+        light = self.model.predict(values, clamp=False)
+        return light.reshape(*light.shape[:-2], *self.model.covered.shape, 3)
+
+    def towards(self, values: Any, directions: Any) -> np.ndarray:
+        """Values of the functions in a direction (3,), or in one for each place (places, 3); never below 0."""
+        return self.layer.towards(self.predict(values), np.asarray(directions, np.float64))
 
 
 def _real(values: Any) -> np.ndarray:

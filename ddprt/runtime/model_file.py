@@ -14,16 +14,18 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from ddprt import __version__
+from ddprt.dataset.layers import Layer
 from ddprt.errors import UserError
 from ddprt.files import read_tensors, sha256, write_tensors, write_text
 from ddprt.fitting.encoding import Encoding
 from ddprt.methods import METHODS
 from ddprt.methods.method import FitReport
-from ddprt.runtime.model import Model
+from ddprt.runtime.model import LayerModel, Model
 from ddprt.runtime.trust import Yardstick
 from ddprt.sampling.points import Samples
 
 SCHEMA = 1
+_PLACES = ("position", "weight", "texel")  # tensors of a layer
 
 
 class _Part(BaseModel):
@@ -52,10 +54,17 @@ class _Trust(_Part):
     fade_from: float = Field(ge=0, le=1)
 
 
+class _Layer(_Part):
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9 -]*$")
+    quantity: Literal["irradiance", "radiance"]
+    order: int = Field(ge=0, le=32)
+
+
 class _Document(BaseModel):
     """What model.json holds; keys of later versions of the same schema are passed over."""
 
     encoding: _Encoding
+    layers: tuple[_Layer, ...] = ()
     points: _Points
     report: FitReport
     trust: _Trust | None = None
@@ -78,6 +87,9 @@ def save_model(model: Model, folder: Path) -> None:
     }
     if model.uv is not None:
         tensors["scene.uv"] = model.uv
+    for name, part in model.layers.items():
+        tensors |= {f"layers.{name}.{entry}": getattr(part.layer, entry) for entry in _PLACES}
+        save_model(part.model, folder / "layers" / name)
     trust: dict[str, float] = {}
     if model.yardstick is not None:
         for entry in fields(model.yardstick):
@@ -114,6 +126,7 @@ def save_model(model: Model, folder: Path) -> None:
         "relighter": static,
         "report": asdict(model.relighter.report),
         "trust": trust or None,
+        **({"layers": [_layer_entry(part.layer) for part in model.layers.values()]} if model.layers else {}),
         "unit": "W/m2",
         "tensors_sha256": sha256(folder / "tensors.safetensors"),
     }
@@ -145,7 +158,8 @@ def load_model(folder: str | Path) -> Model:
         odd = [name for name, array in tensors.items() if not np.isfinite(array).all()]
         if odd:
             raise ValueError(f"got NaN or infinity in {odd[0]}")
-        model = _assemble(document, checked, tensors, relighter_type)
+        parts = {entry.name: load_model(folder / "layers" / entry.name) for entry in checked.layers}
+        model = _assemble(document, checked, tensors, relighter_type, parts)
         model.predict(np.zeros((model.points, 3)))
         model.trust(np.zeros((model.points, 3)))
     except UserError:
@@ -162,7 +176,24 @@ def load_model(folder: str | Path) -> Model:
     return model
 
 
-def _assemble(document: dict[str, Any], checked: _Document, tensors: dict[str, np.ndarray], relighter_type: type) -> Model:
+def _layer_entry(layer: Layer) -> dict[str, Any]:
+    return {"name": layer.name, "quantity": layer.quantity, "order": layer.order}
+
+
+def _layer_model(entry: _Layer, tensors: dict[str, np.ndarray], model: Model) -> LayerModel:
+    layer = Layer(entry.name, entry.quantity, entry.order, *(tensors[f"layers.{entry.name}.{key}"] for key in _PLACES))
+    if model.covered.shape != (len(layer.position), layer.coefficients):
+        raise ValueError(f"got a model of {model.covered.shape} for layer {entry.name}")
+    return LayerModel(layer, model)
+
+
+def _assemble(
+    document: dict[str, Any],
+    checked: _Document,
+    tensors: dict[str, np.ndarray],
+    relighter_type: type,
+    parts: dict[str, Model],
+) -> Model:
     arguments: dict[str, Any] = {}
     for entry in fields(relighter_type):
         static = document["relighter"].get(entry.name)
@@ -195,6 +226,7 @@ def _assemble(document: dict[str, Any], checked: _Document, tensors: dict[str, n
         document["scene"],
         uv,
         None if checked.trust is None else _yardstick(checked.trust, tensors),
+        {entry.name: _layer_model(entry, tensors, parts[entry.name]) for entry in checked.layers},
     )
 
 

@@ -15,6 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from ddprt import seeds
 from ddprt.config import Config
+from ddprt.dataset.layers import Layer, LayerData, layers
 from ddprt.dataset.pack import Pack
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
@@ -24,7 +25,7 @@ from ddprt.methods import make_method
 from ddprt.methods.floors import MeanLightmap, MeanMap
 from ddprt.methods.method import Examples, Frame, Maps, Method, Relighter, block_texels, unseen_share
 from ddprt.methods.statuses import BLIND
-from ddprt.runtime.model import Model
+from ddprt.runtime.model import LayerModel, Model
 from ddprt.runtime.trust import Yardstick, calibrated, make_yardstick, outside
 from ddprt.sections import FitConfig
 
@@ -113,6 +114,11 @@ def fit_method(
     train, validation = (examples(data, split, encoding, config, points, quantity, pack) for split in ("train", "validation"))
     relighter = method.fit(train, validation, key=jax.random.key(seeds.number(seed, f"method {name}")))
     relighter, yardstick = _judged(relighter, encoding, train, validation)
+
+    def of_layer(layer: Layer) -> LayerModel:
+        part = LayerData.of(data, layer)
+        return LayerModel(layer, fit_method(part, config, name, settings, points=points, quantity=quantity, seed=seed))
+
     return Model(
         name,
         relighter,
@@ -126,6 +132,7 @@ def fit_method(
         {key: data.description["scene"][key] for key in ("name", "digest")},
         data.uv,
         yardstick,
+        {} if isinstance(data, LayerData) else {layer.name: of_layer(layer) for layer in layers(data)},
     )
 
 
@@ -177,14 +184,15 @@ def _squares(relighter: Relighter | None, encoding: Encoding, examples: Examples
         values = frame.values if truth is light else frame.values[part]
         scale = examples.scale if truth is light else examples.scale[part]
         largest = jnp.max(examples.scale, initial=0)
-        found = _squares_of(relighter, encoding, values, frame.positions, frame.normals, truth, scale, largest, area, lightings)
+        seen = values, frame.positions, frame.normals
+        found = _squares_of(relighter, encoding, *seen, truth, scale, largest, area, lightings, not examples.signed)
         squares.append(np.asarray(found[0], np.float64))
         peaks.append(float(found[1]))
     unit = max((peak for peak in peaks if peak > 0), default=1.0)
     return np.concatenate([part * ((peak or 1.0) / unit) ** 2 for part, peak in zip(squares, peaks, strict=True)])
 
 
-@partial(jax.jit, static_argnames="lightings")
+@partial(jax.jit, static_argnames=("lightings", "clamp"))
 def _squares_of(
     relighter: Relighter | None,
     encoding: Encoding,
@@ -196,14 +204,14 @@ def _squares_of(
     largest: Array,
     area: Array,
     lightings: tuple[Lighting, ...] | None,
+    clamp: bool,
 ) -> tuple[Array, Array]:
     """The squares of some lightings in units of the peak of their own, and that peak."""
     relative = scale / jnp.maximum(largest, jnp.finfo(jnp.float32).tiny)
-    truth = encoding.decode(indirect, relative)
+    truth = encoding.decode(indirect, relative, clamp=clamp)
     peak = jnp.max(jnp.abs(truth), initial=0)
-    answer = (
-        0.0 if relighter is None else encoding.decode(relighter.predict(Frame(values, positions, normals, lightings)), relative)
-    )
+    frame = Frame(values, positions, normals, lightings)
+    answer = 0.0 if relighter is None else encoding.decode(relighter.predict(frame), relative, clamp=clamp)
     return jnp.einsum("ltc,t->l", ((answer - truth) / jnp.where(peak > 0, peak, 1)) ** 2, area), peak
 
 
@@ -237,7 +245,8 @@ def examples(
         indirect = StreamedMaps(pack, tuple(indices), encoding, scale)
         dark = bool((np.asarray(scale) == 0).any())  # else there is no need to look
         unseen = unseen_share(np.asarray(scale), (pack.read([index])[0] for index in indices)) if dark else 0.0
-    return Examples(frame, indirect, scale, np.asarray(data.area, np.float32), config.weights, config.channels, unseen)
+    area, signed = np.asarray(data.area, np.float32), isinstance(data, LayerData)
+    return Examples(frame, indirect, scale, area, config.weights, config.channels, unseen, signed)
 
 
 @jax.jit

@@ -1,7 +1,10 @@
 """How many rays each texel gets: as many as a target for the noise asks, and more where they are needed."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
+from heapq import heapreplace
 from typing import Any
 
 import numpy as np
@@ -10,14 +13,15 @@ from ddprt import seeds
 from ddprt.axes import Float32, Float64, Int
 from ddprt.sections import TransportConfig
 from ddprt.transport.footprint import Footprints, find_footprints
-from ddprt.transport.gather import Receivers
+from ddprt.transport.gather import Pattern, Receivers, seen_from
 from ddprt.transport.near import NearField, columns_of
 from ddprt.transport.operator import Operator
 
 _PILOT = 8  # rays of every texel that tell distances and variances, and are thrown away
 _PROBED = 1024  # texels whose noise is measured
-_TIMED = 1 << 18  # rays of each thread, at most, that tell how long one takes
+_TIMED = 1 << 18  # rays of each thread and turn, at most, that tell how long one takes
 _TIMED_SHARE = 8  # of all rays, this part at most
+_TURNS = 2  # times that rays are timed, with other texels: a machine does not always do the same
 _TILES = 8  # neighbours' tiles that go through together in a gather
 _LIGHTINGS = 32  # that are looked at
 _FEW, _MANY = 24, 96  # rays there, twice each; no powers of two, which do 10 % better than what lies between
@@ -93,58 +97,143 @@ def choose_rays(
     rays = np.maximum(1, np.rint(share * (samples / halves))).astype(np.int64)
     expected = np.sqrt(few * ratio * (samples / halves / _FEW) ** -power / halves)
     facts = {"samples": round(float(rays.mean()) * halves, 1), "noise_expected": float(f"{expected:.3g}")}
-    each, traced = (per_ray * rays.sum() * halves for per_ray in _cost_per_ray(operator, *whole, rays))
-    facts["seconds_expected"] = float(f"{each:.2g}")
+    seconds, traced = (halves * cost for cost in _cost(operator, *whole, rays))
+    facts["seconds_expected"] = float(f"{seconds:.2g}")
     if adaptive:
         facts["variance_over_even"] = round(ratio, 3)
-    return Choice(rays, footprints, facts, power, float(each), int(traced))
+    return Choice(rays, footprints, facts, power, seconds, int(traced))
 
 
-def _cost_per_ray(
+def _cost(
     operator: Operator,
     radiosity: Float32[np.ndarray, "senders columns"],
     near: NearField | None,
     rays: Int[np.ndarray, " texels"],
 ) -> tuple[float, float]:
-    """Seconds that a ray takes on all threads together, with all lightings and near senders, and rays traced for each.
+    """Seconds of a gather on all threads, and its rays with those that go on from near senders.
 
-    Each thread gathers a stretch as the bake will: as many neighbours with as many rays each, since rays of neighbours cost
-    less than scattered ones, fewer of them stay in the cache where texels have few, and every stretch lights its near senders
-    once for every lighting, which on a statue costs as much as its rays. What a call costs before its first ray is in a call
-    for a single texel, and drops out.
+    Two things cost: rays, with what near senders add to each, and stretches that meet near senders, each of which lights them
+    once for every lighting; on a statue that comes to as much as its rays. Both are timed as the bake does them, as many
+    neighbours with as many rays each: rays of neighbours cost less than scattered ones. What a call costs before its first ray
+    is in a call for a single texel, and drops out.
     """
-    threads = operator.tracer.threads
+    if not rays.any():
+        return 0.0, 0.0
+    threads, gathered = operator.tracer.threads, partial(_timed, operator, radiosity)
     values, numbers = np.unique(rays[rays > 0], return_counts=True)
     usual = int(values[np.argmax(values * numbers)])  # of the texels that hold most of the rays
-    there = np.flatnonzero(rays == usual)
     tile = _tile(operator, usual)
     most = min(_TIMED, int(rays.sum()) // (_TIMED_SHARE * threads)) // usual
-    windows, size = max(1, min(_TILES, most // tile)), min(tile, max(most, 16), len(there))
-    starts = np.linspace(0, len(there) - size, windows * threads).astype(int).reshape(windows, threads)
+    windows, size = max(1, min(_TILES, most // tile)), min(tile, max(most, 16))
+    odds = _near_odds(operator, near, min(_PILOT, max(1, usual // _PILOT))) if near else np.zeros(len(rays))
+    lighting = 0.0
+    if odds.any():
+        nearest = [np.argsort(-odds, kind="stable")[:1]] * threads  # of one texel: what it costs before the first shadow ray
+        lighting = max(0.0, gathered(nearest, _PILOT, near)[0] - gathered(nearest, _PILOT, None)[0])
+    dealt = _standing_for_all(rays, odds, size, _TURNS * windows * threads)
     spent = []
-    for single in (True, False):
-
-        def work(thread: int, single: bool = single) -> int:
-            own = np.unique(np.concatenate([there[first : first + size] for first in starts[:, thread]]))
-            texels = own[:1] if single else own
-            field = None if single else near
-            operator.gather_some(radiosity, texels, usual, seed=thread, stream="rate", near=field)
-            return len(texels)
-
-        begun, before = time.perf_counter(), operator.tracer.rays
-        asked = usual * sum(operator.tracer.map(work, range(threads)))
-        spent.append(np.array([time.perf_counter() - begun, operator.tracer.rays - before, asked]))
-    seconds, traced, asked = spent[1] - spent[0]
+    for turn in range(_TURNS):
+        shares = [dealt[turn * threads + thread :: _TURNS * threads] or dealt[:1] for thread in range(threads)]
+        own = [np.unique(np.concatenate(tiles)) for tiles in shares]
+        whole, one = gathered(own, usual, near), gathered([texels[:1] for texels in own], usual, None)
+        lit = lighting * np.mean([odds[texels].any() for texels in own])
+        spent.append([whole[0] - one[0] - lit, whole[1] - one[1], whole[2] - one[2], 0.1 * whole[0]])
+    seconds, asked, traced, least = np.sum(spent, 0)
     if asked == 0:  # an atlas of a single texel
-        seconds, traced, asked = spent[1]
-    return max(seconds, 0.1 * spent[1][0]) / asked, traced / asked  # a busy machine may turn the two around
+        seconds, asked, traced = gathered(own, usual, near)
+    each = max(seconds, least) / asked  # a busy machine may turn whole and single around
+    return _until_done(_spans(operator, rays, odds, threads * each, lighting), threads), rays.sum() * traced / asked
+
+
+def _timed(
+    operator: Operator,
+    radiosity: Float32[np.ndarray, "senders columns"],
+    own: Sequence[np.ndarray],
+    samples: int,
+    near: NearField | None,
+) -> tuple[float, int, int]:
+    """Seconds that a thread is busy with texels of its own while all are, rays asked of all, and rays traced."""
+
+    def work(thread: int) -> float:
+        begun = time.perf_counter()
+        operator.gather_some(radiosity, own[thread], samples, seed=thread, stream="rate", near=near)
+        return time.perf_counter() - begun
+
+    before = operator.tracer.rays
+    seconds = float(np.mean(list(operator.tracer.map(work, range(len(own))))))
+    return seconds, samples * sum(map(len, own)), operator.tracer.rays - before
+
+
+def _near_odds(operator: Operator, near: NearField, samples: int) -> Float64[np.ndarray, " texels"]:
+    """How many near senders a ray of each texel meets for every far one; by so many rays, one more taken to be far.
+
+    Odds, not the share of near rays: a ray that meets something near goes on from there, where as much is near. In a crevice
+    it goes on many times.
+    """
+    receivers = Receivers.texels(operator.atlas, samples, 0, "near odds")
+
+    def work(stretch: slice) -> np.ndarray:
+        met = np.zeros(stretch.stop - stretch.start)
+        for tile in receivers.tiles(within=stretch):
+            own = met[tile.start - stretch.start : tile.stop - stretch.start]
+            for seen in seen_from(operator.tracer, receivers, tile, operator.landing):
+                own += np.bincount(near.pick(seen, 0).receiver, minlength=len(own))
+        return met / (samples + 1 - met)
+
+    return np.concatenate(list(operator.tracer.map(work, receivers.tiles(_TILES))))
+
+
+def _standing_for_all(
+    rays: Int[np.ndarray, " texels"], odds: Float64[np.ndarray, " texels"], size: int, count: int
+) -> list[np.ndarray]:
+    """At most so many tiles of neighbours with as many rays, which stand for as many rays each.
+
+    Texels in corners have ten times the near senders of others, and more rays, so a few tiles at equal distances tell little.
+    Here tiles are sorted by their odds of near senders and dealt into strata of equal rays; of each goes the tile that is
+    nearest to its mean, and among equals the one in the middle.
+    """
+    order = np.argsort(rays, kind="stable")[np.count_nonzero(rays == 0) :]
+    _, first, number = np.unique(rays[order], return_index=True, return_counts=True)
+    starts = np.concatenate([np.arange(start, start + many, size) for start, many in zip(first, number, strict=True)])
+    weight = np.add.reduceat(rays[order].astype(np.float64), starts)
+    level = np.add.reduceat((rays * odds)[order], starts) / weight
+    tiles, ranked = np.split(order, starts[1:]), np.argsort(level, kind="stable")
+    upto = np.cumsum(weight[ranked]) - weight[ranked] / 2
+    stratum = (upto * (count / weight.sum())).astype(int)
+    chosen = []
+    for ranks in np.split(np.arange(len(ranked)), np.flatnonzero(np.diff(stratum)) + 1):
+        inside = ranked[ranks]
+        off = np.abs(level[inside] - np.average(level[inside], weights=weight[inside]))
+        chosen.append(inside[np.lexsort((np.abs(ranks - ranks.mean()), off))[0]])
+    return [tiles[index] for index in chosen]
+
+
+def _spans(
+    operator: Operator, rays: Int[np.ndarray, " texels"], odds: Float64[np.ndarray, " texels"], each: float, lighting: float
+) -> list[float]:
+    """Seconds of each stretch of a gather, in its order, at so many for a ray and for lighting what is near."""
+    spans = []
+    for samples in np.unique(rays[rays > 0]):
+        there, step = np.flatnonzero(rays == samples), _TILES * _tile(operator, int(samples))
+        for start in range(0, len(there), step):
+            texels = there[start : start + step]
+            spans.append(float(each * samples * len(texels) + lighting * odds[texels].any()))
+    return spans
+
+
+def _until_done(spans: Sequence[float], threads: int) -> float:
+    """Seconds until all is done, each span by the thread that is free first."""
+    busy = [0.0] * threads
+    for span in spans:
+        heapreplace(busy, busy[0] + span)
+    return max(busy)
 
 
 def _tile(operator: Operator, samples: int) -> int:
     """Texels whose rays a gather traces together."""
-    some = Receivers.texels(operator.atlas, samples, 0, "rate", np.arange(min(operator.atlas.count, _MOST)))
-    first = next(some.tiles())
-    return first.stop - first.start
+    disk, none = np.zeros((samples, 1, 2), np.float32), np.zeros(0, np.int32)
+    bare = Receivers(operator.atlas.sampler, Pattern(disk, disk), none, none, np.zeros((0, 2), np.float32))
+    return next(bare.tiles(within=slice(0, _MOST))).stop
 
 
 def allot(
@@ -159,7 +248,6 @@ def allot(
       variance: of one ray.
       burden: weight of each texel's variance in the total squared error.
       power: how fast variance falls with the number of rays; 1 for independent ones.
-      seconds, traced: of the gather, both halves of held-out maps; with the rays that go on from near senders.
     Returns:
       The expected variance over that of an even share, and rays over their mean: 1 and ones where even is about as good.
     """

@@ -48,6 +48,7 @@ def make_yardstick(
 
     Held-out lightings are those that a bake of `config` has. To them come the frames of a path about the first one
     (`bench.path_frames`), which only flicker is told of. Points and training maps, which nobody uses, are the fewest allowed.
+    Held-out lightings are drawn whatever `lightings.choose` says, so bases that choose theirs and that do not share a truth.
 
     Args:
       scene: what is lit.
@@ -61,6 +62,8 @@ def make_yardstick(
     frames = config.bench.path_frames
     if 0 < frames < _FEWEST:
         raise UserError(f"bench.path_frames: got {frames}, expected 0 or at least {_FEWEST}; raise it, or set it to 0")
+    drawn = config.lightings.model_copy(update={"choose": "random", "target_error": 0.0})
+    config = config.model_copy(update={"lightings": drawn})
     tracer = Tracer.of(scene, config.transport.threads)
     splits = {name: lightings[: None if name == "test" else 1] for name, lightings in _lightings(scene, config, tracer).items()}
     path = light_path(splits["test"][0], tracer.clearance, frames, seed=config.seed) if frames else ()
@@ -77,7 +80,7 @@ def _lightings(scene: Scene, config: Config, tracer: Tracer) -> dict[str, list[A
     """Lightings of each split, of which training and validation may be cut short."""
     settings = config.lightings
     if not settings.file:  # each is drawn by itself, so fewer of the others leave the held-out ones alone
-        settings = settings.model_copy(update={"train": 1, "validation": 1, "choose": "random"})
+        settings = settings.model_copy(update={"train": 1, "validation": 1})
     entries, _ = choose_lightings(None, settings, scene, tracer, config.seed)
     return {name: [lighting for split, lighting in entries if split == name] for name in SPLITS}
 

@@ -5,9 +5,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from ddprt.bench.page import write_all
-from ddprt.bench.settings import Setting, settings_of
-from ddprt.bench.trial import Workshop, about, environment, why
+from ddprt.bench.frontier.page import write_all
+from ddprt.bench.measure.settings import Setting, settings_of
+from ddprt.bench.measure.trial import Workshop, about, environment, why
 from ddprt.config import Config
 from ddprt.errors import UserError
 from ddprt.files import alone_in, append_line, make_folder

@@ -10,10 +10,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ddprt.bench.best_fit import best_transfer, projected
-from ddprt.bench.budget import Budget, engine_values
-from ddprt.bench.budget_bakes import Bakery
-from ddprt.bench.chain import squared_error
+from ddprt.bench.budget.bakes import Bakery
+from ddprt.bench.budget.best_fit import best_transfer, projected
+from ddprt.bench.budget.budget import Budget, engine_values
+from ddprt.bench.budget.chain import squared_error
 from ddprt.config import Config, checked
 from ddprt.dataset.store import Dataset
 from ddprt.methods.svd_ridge import LinearTransfer

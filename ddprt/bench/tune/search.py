@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ddprt.bench.planner import KNOBS, QUANTITIES, Place, Plan, Planner, Trial
-from ddprt.bench.settings import Setting, changed
-from ddprt.bench.timing import timed
-from ddprt.bench.trial import Workshop, about, environment, why
+from ddprt.bench.measure.settings import Setting, changed
+from ddprt.bench.measure.timing import timed
+from ddprt.bench.measure.trial import Workshop, about, environment, why
+from ddprt.bench.tune.planner import KNOBS, QUANTITIES, Place, Plan, Planner, Trial
 from ddprt.config import Config
 from ddprt.dataset.forecast import forecast
 from ddprt.dataset.store import Dataset
@@ -72,6 +72,7 @@ class Search:
       workshop: where settings are tried.
       factors: what each of `KNOBS` may be, over the base.
       measure: what is found at a place, for those who know it already; None bakes there.
+      expected: seconds that the base's bake is forecast to take, for those who know; None forecasts where that matters.
     Raises:
       UserError: no limit is set, or another method than svd-ridge is to be tuned.
     """
@@ -82,6 +83,7 @@ class Search:
         workshop: Workshop,
         factors: Mapping[str, Sequence[float]] = FACTORS,
         measure: Callable[[Place], Trial] | None = None,
+        expected: float | None = None,
     ) -> None:
         limits = {name: getattr(config.tune, f"max_{name}") for name in QUANTITIES}
         self.limits = {name: limit for name, limit in limits.items() if limit > 0}
@@ -98,6 +100,7 @@ class Search:
         self.base: Place = tuple(float(_value(config, knob)) for knob in KNOBS)
         values = [_around(config, knob, base, factors[knob]) for knob, base in zip(KNOBS, self.base, strict=True)]
         self._known = measure or self.measure
+        self._expected = expected
         self.bases = tuple(
             count for count in BASES if count > (config.fit.centre == "mean")
         )  # the mean alone is another method
@@ -137,7 +140,9 @@ class Search:
         limit = self.limits.get("bake_seconds")
         if limit is None:
             return self.base
-        expected = forecast(self.workshop.scene, self.config, self.workshop.progress).training_seconds
+        expected = self._expected
+        if expected is None:
+            expected = forecast(self.workshop.scene, self.config, self.workshop.progress).training_seconds
         place = self.base
         for knob, step in ((2, 1), (1, -1), (0, -1)) * 4:
             if expected <= 2 * limit:

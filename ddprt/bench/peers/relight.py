@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ddprt import seeds
-from ddprt.bench.fit_peers import EPS
-from ddprt.bench.standing import OURS, Peer, Row, compare
+from ddprt.bench.peers.fit import EPS
+from ddprt.bench.peers.standing import OURS, Peer, Row, compare
 from ddprt.fitting.encoding import Encoding
 from ddprt.methods.svd_ridge import LinearTransfer, compose
 from ddprt.runtime.model import Model

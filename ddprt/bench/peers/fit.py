@@ -19,12 +19,12 @@ import scipy.linalg
 from jaxtyping import Float
 
 from ddprt import seeds
-from ddprt.bench.standing import OURS, Peer, Row, compare
+from ddprt.bench.peers.standing import OURS, Peer, Row, compare
 from ddprt.config import Config, checked
 from ddprt.dataset.generate import bake
 from ddprt.fitting.basis import fit_basis
 from ddprt.progress import Progress
-from ddprt.scene.files import load_scene
+from ddprt.transport.effects import configured_scene
 
 EPS = 2.0**-24
 """Largest relative error of rounding to float32."""
@@ -100,7 +100,7 @@ def real_spectrum(config: Config, columns: int, progress: Progress) -> np.ndarra
     plain["lightings"] |= {"train": max(2, columns // 3), "validation": 1, "test": 1, "choose": "random"}
     plain["transport"] |= {"samples": 64, "test_samples": 2, "integrator": "operator"}
     plain["points"] |= {"count": 16, "supersample": 1, "choose": "blue-noise"}
-    data = bake(load_scene(config.scene.name, **config.scene.parameters), config=checked(plain), progress=progress)
+    data = bake(configured_scene(config), config=checked(plain), progress=progress)
     maps = data.maps("indirect", data.split("train")).astype(np.float64)
     rows = np.moveaxis(maps, 2, 1).reshape(-1, maps.shape[1])
     norms = np.linalg.norm(rows, axis=1)

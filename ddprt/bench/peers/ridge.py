@@ -15,8 +15,8 @@ import scipy.linalg
 from jaxtyping import Float
 
 from ddprt import seeds
-from ddprt.bench.fit_peers import EPS
-from ddprt.bench.standing import OURS, Peer, Row, compare
+from ddprt.bench.peers.fit import EPS
+from ddprt.bench.peers.standing import OURS, Peer, Row, compare
 from ddprt.fitting.transfer import fit_transfer
 
 _TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)

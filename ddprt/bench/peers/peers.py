@@ -14,11 +14,11 @@ from typing import Any
 import jax
 from threadpoolctl import threadpool_limits
 
-from ddprt.bench import fit_peers, ridge_peers, roofline
-from ddprt.bench.fit_peers import Maps, fit_rows, make_columns, real_spectrum
-from ddprt.bench.relight_peers import RELIGHT, TRANSFER, make_frames, make_model, make_scenes, relight_rows, transfer_rows
-from ddprt.bench.ridge_peers import make_pairs, ridge_rows
-from ddprt.bench.standing import OURS, Row, best
+from ddprt.bench.peers import fit, ridge, roofline
+from ddprt.bench.peers.fit import Maps, fit_rows, make_columns, real_spectrum
+from ddprt.bench.peers.relight import RELIGHT, TRANSFER, make_frames, make_model, make_scenes, relight_rows, transfer_rows
+from ddprt.bench.peers.ridge import make_pairs, ridge_rows
+from ddprt.bench.peers.standing import OURS, Row, best
 from ddprt.config import Config
 from ddprt.machine import commit, installed, machine
 from ddprt.progress import Progress
@@ -113,12 +113,12 @@ def _limits(sizes: Sizes, progress: Progress) -> dict[str, Any]:
 
 def _fits(config: Config, sizes: Sizes, progress: Progress) -> Iterator[dict[str, Any]]:
     spectrum = real_spectrum(config, 3 * sizes.lightings, progress)
-    with progress.stage("fit", len(fit_peers.PEERS)) as stage:
+    with progress.stage("fit", len(fit.PEERS)) as stage:
         maps = Maps(make_columns(spectrum, sizes.texels, config.seed), sizes.bases)
         rows = fit_rows(maps, repeats=sizes.repeats, limit=sizes.limit, tell=stage.advance)
         what = f"fit of {sizes.bases} bases to {len(spectrum)} columns x {sizes.texels} texels, float32"
         yield _comparison("fit", what, rows, maps.blur)
-    with progress.stage("transfer fit", len(ridge_peers.PEERS)) as stage:
+    with progress.stage("transfer fit", len(ridge.PEERS)) as stage:
         pairs = make_pairs(spectrum[: sizes.lightings], sizes.points, sizes.bases, config.seed)
         rows = ridge_rows(pairs, repeats=sizes.repeats * 3, tell=stage.advance)
         what = f"ridge map of {sizes.lightings} lightings, {sizes.points} points to {sizes.bases} coefficients"

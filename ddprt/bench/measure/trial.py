@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from ddprt import __version__
-from ddprt.bench.settings import Setting, digest_of
-from ddprt.bench.timing import peak_memory, timed
-from ddprt.bench.yardstick import Yardstick, make_yardstick
+from ddprt.bench.measure.settings import Setting, digest_of
+from ddprt.bench.measure.timing import peak_memory, timed
+from ddprt.bench.measure.yardstick import Yardstick, make_yardstick
 from ddprt.config import Config
 from ddprt.dataset.generate import bake
 from ddprt.dataset.splits import SPLITS, choose_lightings
@@ -30,8 +30,8 @@ from ddprt.progress import Progress
 from ddprt.runtime.model import Model
 from ddprt.runtime.precision import shipped_bytes, stored
 from ddprt.runtime.train import fit_config
-from ddprt.scene.files import load_scene
 from ddprt.scene.mesh import Scene
+from ddprt.transport.effects import configured_scene
 from ddprt.transport.embree import Tracer
 
 SCHEMA = 1
@@ -61,7 +61,7 @@ class Workshop:
     @cached_property
     def scene(self) -> Scene:
         """The scene of the configuration."""
-        return load_scene(self.config.scene.name, **self.config.scene.parameters)
+        return configured_scene(self.config)
 
     @cached_property
     def truth(self) -> str:
@@ -83,10 +83,8 @@ class Workshop:
         Raises:
           UserError: it is black, or whatever hinders a bake.
         """
-        drawn = self.config.lightings.model_copy(update={"choose": "random", "target_error": 0.0})  # held-out ones always are
-        config = self.config.model_copy(update={"lightings": drawn})
         place = self.folder / f"truth-{self.truth}"
-        found = make_yardstick(self.scene, config, place, self.progress, resolution=self.resolution)
+        found = make_yardstick(self.scene, self.config, place, self.progress, resolution=self.resolution)
         if found.noise is None:
             raise UserError(
                 "lightings: got held-out lightings without indirect light, expected some to score on; "
@@ -135,7 +133,7 @@ class Workshop:
                 return open_dataset(folder), before["bake"]
         shutil.rmtree(folder, ignore_errors=True)
         config, lightings = self._training_only(setting.config)
-        scene = load_scene(config.scene.name, **config.scene.parameters)
+        scene = configured_scene(config)
         progress = Progress(self.progress.quiet)
         progress.say(f"bake: {setting.name}")
         with peak_memory() as peak:

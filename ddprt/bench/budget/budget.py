@@ -38,10 +38,10 @@ from typing import Any
 import numpy as np
 
 from ddprt.axes import Float32, Float64
-from ddprt.bench.best_fit import best_transfer, projected, same_fit
-from ddprt.bench.budget_bakes import Bakery, Yardsticks
-from ddprt.bench.chain import Link, Parts, take_apart
-from ddprt.bench.shadow_maps import engine_irradiance
+from ddprt.bench.budget.bakes import Bakery, Yardsticks
+from ddprt.bench.budget.best_fit import best_transfer, projected, same_fit
+from ddprt.bench.budget.chain import Link, Parts, take_apart
+from ddprt.bench.budget.shadow_maps import engine_irradiance
 from ddprt.dataset.store import average_into_points
 from ddprt.errors import UserError
 from ddprt.lights import Lighting

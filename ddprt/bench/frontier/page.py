@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from ddprt import __version__
-from ddprt.bench import pareto
-from ddprt.bench.pareto import COSTS, DRAWN, ERRORS, Form, Leg, Measure, Record
+from ddprt.bench.frontier import pareto
+from ddprt.bench.frontier.pareto import COSTS, DRAWN, ERRORS, Form, Leg, Measure, Record
 from ddprt.files import make_folder, write_text
 from ddprt.report import words
 from ddprt.report.fronts import SHAPES, STAR, Axis, Cloud, front_figure, marker
@@ -264,7 +264,7 @@ class Sweep:
 def _page(found: Sweep, title: str) -> str:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    loader = PackageLoader("ddprt", "bench")
+    loader = PackageLoader("ddprt.bench", "frontier")
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     return environment.get_template("page.html.j2").render(
         version=__version__,

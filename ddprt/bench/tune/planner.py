@@ -128,8 +128,8 @@ class Planner:
       bases: numbers of bases that may be asked for, rising.
       precisions: that may be stored.
       limits: the budget; quantities that are missing are free.
-      trials: what was learned from.
-      barred: places that cannot be baked.
+      trials: what was learned from, at places made of `values`.
+      barred: places that cannot be baked, so none that was tried.
     """
 
     base: Place
@@ -154,7 +154,7 @@ class Planner:
 
         A plan whose place was tried is taken as soon as it is safe. Before that, the likeliest to meet the budget; of plans
         that are safe, the cheapest bake. Where no error is asked for it is the least one that is safe, and a place that was
-        tried is only left for one that promises a twentieth less.
+        tried is only left for one that promises a twentieth less. At least one place was tried before.
         """
         asked = "relative_rmse" in self.limits
         best: dict[bool, tuple[tuple[float, float], Plan, float]] = {}
@@ -169,10 +169,9 @@ class Planner:
                 tried = told[1]
                 if tried not in best or rank > best[tried][0]:
                     best[tried] = rank, Plan(place, bases, precision), chance
-        there, elsewhere = best.get(True), best.get(False)
-        if elsewhere is None or there is None:
-            (_, plan, chance) = there or elsewhere or (None, Plan(self.base, self.bases[0], self.precisions[0]), 0.0)
-            return plan, chance
+        there, elsewhere = best[True], best.get(False)
+        if elsewhere is None:
+            return there[1:]
         safe = there[0][0] == _SURE and (asked or elsewhere[0][1] - there[0][1] < _WORTHWHILE)
         return (there if safe or there[0] >= elsewhere[0] else elsewhere)[1:]
 

@@ -15,7 +15,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import jax
 import numpy as np
 
-from ddprt.bench.timing import Timing, compiling, peak_memory
+from ddprt.bench.measure.timing import Timing, compiling, peak_memory
 
 OURS = "ddprt"
 _PIP = {"sklearn": "scikit-learn"}  # packages that pip calls otherwise

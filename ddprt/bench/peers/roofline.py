@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ddprt.bench.timing import timed
+from ddprt.bench.measure.timing import timed
 from ddprt.compiled import compiled
 
 BEYOND = 4

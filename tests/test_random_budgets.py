@@ -1,0 +1,126 @@
+"""What `experiments/frontier.py` asks of `tune`: it goes on where it was stopped, and judges refusals as a slow twin does."""
+
+import json
+import sys
+import time
+from dataclasses import asdict, replace
+from itertools import product
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ddprt.bench.peers import roofline
+from ddprt.bench.tune.planner import Place, Trial
+from ddprt.bench.tune.search import Search
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
+
+import frontier
+
+TRIAL = Trial(
+    (32.0, 24.0, 0.02, 64.0),
+    (1, 4, 16),
+    (0.4, 0.2, 0.1),
+    0.05,
+    (50.0, 80.0, 200.0),
+    {"half": (0.1, 0.4, 1.6), "float": (0.2, 0.8, 3.2)},
+    3.0,
+    0.5,
+)
+
+
+@pytest.fixture
+def visited(monkeypatch: pytest.MonkeyPatch) -> list[Place]:
+    """Places where a bake would have been made; what is found there is made up."""
+    seen: list[Place] = []
+
+    def measure(_: Search, place: Place) -> Trial:
+        seen.append(place)
+        if len(seen) == 4:
+            raise RuntimeError("power cut")
+        return replace(TRIAL, place=place, bake_seconds=float(len(seen)))
+
+    monkeypatch.setattr(Search, "measure", measure)
+    return seen
+
+
+def test_a_grid_goes_on_where_it_was_stopped(visited: list[Place], tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match="power cut"):
+        frontier.Contest("cornell", tmp_path, quick=True).grid()
+    known = frontier.Contest("cornell", tmp_path, quick=True).grid()
+    assert visited[3] == visited[4]  # the place that was cut off
+    assert len(set(visited)) == len(visited) - 1 == len(known) == 8
+    assert [known[place].bake_seconds for place in visited[:3]] == [1, 2, 3]
+    assert list(known) == visited[:3] + visited[4:]
+    frontier.Contest("cornell", tmp_path, quick=True).grid()
+    assert len(visited) == 9
+
+
+def test_what_was_measured_of_other_settings_is_not_taken(visited: list[Place], tmp_path: Path) -> None:
+    visited.extend([()] * 4)  # none is cut off
+    frontier.Contest("cornell", tmp_path, quick=True).grid()
+    lines = (tmp_path / "grid.jsonl").read_text("utf-8").splitlines()
+    for line in lines:
+        entry = json.loads(line)
+        entry["key"][1] = "another truth"
+        (tmp_path / "grid.jsonl").write_text(json.dumps(entry) + "\n", "utf-8")
+    frontier.Contest("cornell", tmp_path, quick=True).grid()
+    assert len(visited) == 4 + 2 * 8
+
+
+def test_time_that_is_up_ends_it_in_one_line(visited: list[Place], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert frontier.tune(["cornell", "--minutes", "0", "--out", str(tmp_path)]) == 1
+    assert capsys.readouterr().out == "cornell: 0 of 60 places measured, time is up; the same command goes on from here\n"
+    assert not visited
+    assert frontier.Contest("cornell", tmp_path / "more", quick=True, until=time.perf_counter() + 3600)
+    assert (tmp_path / "cornell").is_dir()
+
+
+def test_a_trial_comes_back_from_json() -> None:
+    assert frontier.trial_of(json.loads(json.dumps(asdict(TRIAL)))) == TRIAL
+    assert frontier.seconds(TRIAL) == 3.5
+
+
+def test_refusals_are_judged_by_all_that_a_place_can_do() -> None:
+    rng = np.random.default_rng(3)
+    seen = set()
+    for _ in range(200):
+        room = rng.uniform(0.6, 1.8, 4)
+        limits = {"relative_rmse": 0.2, "frame_us": 80.0, "megabytes": 0.4, "bake_seconds": 3.0}
+        limits = {name: limit * share for (name, limit), share in zip(limits.items(), room, strict=True)}
+        expected = False
+        for bases, precision in product((1, 2, 4, 8, 16), ("half", "float")):
+            # Curves are straight in logarithms between the numbers of bases that were scored.
+            where = np.interp(np.log(bases), np.log(TRIAL.bases), range(3))
+            low, share = min(int(where), 1), where - min(int(where), 1)
+
+            def at(curve: tuple[float, ...], low: int = low, share: float = share) -> float:
+                return float(curve[low] ** (1 - share) * curve[low + 1] ** share)
+
+            fits = at(TRIAL.errors) <= limits["relative_rmse"] and at(TRIAL.frame_us) <= limits["frame_us"]
+            expected |= fits and at(TRIAL.megabytes[precision]) <= limits["megabytes"] and limits["bake_seconds"] >= 3
+        assert frontier.meets(TRIAL, limits, (1, 2, 4, 8, 16, 32)) == expected, limits
+        seen.add(expected)
+    assert seen == {True, False}
+
+
+def test_cold_models_lie_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = frontier.Sizes(side=16, bases=3, points=5)
+    monkeypatch.setattr(roofline, "cache_bytes", lambda: roofline.Cache(4 * 256 * 3, "told"))
+    scenes = frontier.cold_scenes(sizes, 0)
+    assert len(scenes.models) == 1 + roofline.BEYOND
+    bases = [frontier.relight.learned(model).basis for model in scenes.models]
+    assert len({jnp.asarray(basis).unsafe_buffer_pointer() for basis in bases}) == len(bases)
+    assert all(np.array_equal(basis, bases[0]) for basis in bases)
+
+
+def test_who_is_left_out_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    kept = frontier._kept(frontier.fit.PEERS, frontier.QUICK_FIT)
+    assert {peer.name for peer in kept} == set(frontier.QUICK_FIT)
+    told = capsys.readouterr().out
+    assert all(peer.name in told for peer in frontier.fit.PEERS if peer not in kept)
+    assert {peer.name for peer in frontier._kept(frontier.relight.RELIGHT, frontier.QUICK_RELIGHT)} == set(
+        frontier.QUICK_RELIGHT
+    )
