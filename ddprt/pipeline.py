@@ -277,7 +277,8 @@ def _effects(effects: Plan, stages: list[dict[str, Any]], data: Dataset) -> list
     rows = []
     for effect in effects.effects:
         bounces = effect.name == "diffuse bounces"
-        own = [s for s in stages if str(s["name"]).startswith("indirect" if bounces else "direct") and effect.called]
+        of = "indirect" if bounces else "direct" if effect.name.endswith(" lights") else effect.name
+        own = [s for s in stages if str(s["name"]).startswith(of) and effect.called]
         share = indirect if bounces else by_kind.get(effect.name.removesuffix(" lights"), 0.0)
         cost = {"rays": sum(int(s.get("rays", 0)) for s in own), "seconds": round(sum(float(s["seconds"]) for s in own), 4)}
         rows.append({**asdict(effect), **cost, "energy_share": share / total if total > 0 else 0.0})

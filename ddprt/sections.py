@@ -55,7 +55,7 @@ class LightingsConfig(Section):
     distribution: Literal["room", "around"] = Field(
         "room", description="room: free space inside the bounding box; around: a shell about the asset"
     )
-    kinds: tuple[Literal["point", "spot", "directional", "rect", "sphere"], ...] = Field(
+    kinds: tuple[Literal["point", "spot", "directional", "rect", "sphere", "environment"], ...] = Field(
         ("point",), min_length=1, description="kinds of light to draw from, each equally likely"
     )
     lights: tuple[int, int] = Field((1, 1), description="fewest and most lights that are on together")
@@ -69,11 +69,14 @@ class LightingsConfig(Section):
     distance: Range = Field((1.5, 3.0), description="around: distance from the asset's centre in bounding radii")
     elevation_deg: Range = Field((0.0, 90.0), description="around: height above the horizon")
     intensity: tuple[Annotated[float, Field(gt=0, le=1e25)], Annotated[float, Field(gt=0, le=1e25)]] = Field(
-        (1.0, 1.0), description="W/sr of a lamp at each end of a log-uniform range"
+        (1.0, 1.0), description="W/sr of a lamp at each end of a log-uniform range; W/m² of a directional light; scale of a sky"
     )
     saturation: Range = Field((0.0, 0.0), description="0 is white, 1 a fully saturated random hue")
     spot_outer_deg: Range = Field((25.0, 50.0), description="half-angle of a spot's cone; the inner cone is 0.6 of it")
     size: float = Field(0.05, gt=0.0, description="area lights: half-edge or radius, as a fraction of the bounding radius")
+    environment: str = Field(
+        "sun-sky", min_length=1, description="image of environment lights: an .exr or .hdr file, or white, gradient or sun-sky"
+    )
 
     @model_validator(mode="after")
     def _ranges_rise(self) -> "LightingsConfig":

@@ -18,9 +18,10 @@ from ddprt.config import Config, checked
 from ddprt.dataset import store
 from ddprt.dataset.denoise import find_denoiser
 from ddprt.dataset.indirect import IndirectBake
+from ddprt.dataset.manifest import Manifest, map_name
 from ddprt.dataset.scratch import remove_left
 from ddprt.dataset.splits import SPLITS, Once, Splits, check_choice, choose_lightings, chosen, doubt, grouped
-from ddprt.dataset.store import Dataset, Manifest, map_name
+from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.files import alone_in, write_tensors
 from ddprt.lights import Lighting, lighting_json
@@ -250,9 +251,7 @@ class _Bake:
         dataset = Dataset(self.folder, description, keep_alive)
         self._direct(dataset, manifest, atlas, samples)
         self._judge_lightings(dataset, fresh=there is None)
-        indirect = IndirectBake(self.config, self.scene, self.tracer, atlas, effects, dataset, manifest, self.progress)
-        indirect.run("train", dataset.split("train") + dataset.split("validation"))
-        indirect.run("test", dataset.split("test"))
+        IndirectBake(self.config, self.scene, self.tracer, atlas, effects, dataset, manifest, self.progress).all()
         self._end(description)
         return dataset
 
@@ -333,7 +332,7 @@ class _Bake:
             write_tensors(self.folder / "points.safetensors", {**tensors, **spans})
             manifest.add("points.safetensors")
         if not manifest.holds("scene.safetensors"):
-            write_tensors(self.folder / "scene.safetensors", {"corners": self.scene.corners, "uv": atlas.uv})
+            write_tensors(self.folder / "scene.safetensors", store.scene_tensors(self.scene, atlas))
             manifest.add("scene.safetensors")
         if not all(manifest.holds(name) for name in store.ATLAS_FILES):
             store.write_atlas(self.folder, atlas, manifest)

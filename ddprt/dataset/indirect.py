@@ -11,9 +11,10 @@ from ddprt import seeds
 from ddprt.axes import Float32, Int
 from ddprt.config import Config
 from ddprt.dataset.denoise import denoised
+from ddprt.dataset.manifest import Manifest, map_name
 from ddprt.dataset.sampled import scratched, stored
 from ddprt.dataset.scratch import Scratch
-from ddprt.dataset.store import Dataset, Manifest, map_name, read_map, write_map
+from ddprt.dataset.store import CONSTANT, Dataset, read_map, write_map
 from ddprt.progress import Progress, Stage
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
@@ -44,6 +45,12 @@ class IndirectBake:
     manifest: Manifest
     progress: Progress
 
+    def all(self) -> None:
+        """Bakes whatever is missing."""
+        self.run("train", self.dataset.split("train") + self.dataset.split("validation"))
+        self.run("test", self.dataset.split("test"))
+        self.constant()
+
     def run(self, split: str, indices: list[int]) -> None:
         """Bakes the maps of lightings that share their gather rays: "train" (with validation), or "test"."""
         kinds = ["indirect", "noise"] if split == "test" else ["indirect"]
@@ -63,6 +70,24 @@ class IndirectBake:
             else:
                 self._by_operator(split, indices, todo, kinds, stage)
             stage.facts["rays"] = self.tracer.rays - before
+
+    def constant(self) -> None:
+        """Bakes the light of what glows, if a plan calls for it."""
+        emission = self.effects.module("emission")
+        if emission is None or self.manifest.holds(CONSTANT):
+            return
+        config, before = self.config.transport, self.tracer.rays
+        with self.progress.stage("emission") as stage:
+            address = {"seed": self.config.seed, "bounces": self.effects.bounces}
+            found = emission.constant_light(self.scene, self.tracer, self.atlas, config, **address)
+            if config.test_samples == "auto" and found.relative > 1.5 * config.target_noise:
+                self.progress.warn(
+                    f"transport.target_noise: got {config.target_noise:g}, but the most samples that are taken unasked leave "
+                    f"{found.relative:.2g} in the light of emissive surfaces; raise it, or set transport.test_samples"
+                )
+            write_map(self.dataset.folder / CONSTANT, self.atlas.image(found.irradiance))
+            self.manifest.add(CONSTANT)
+            stage.facts |= found.facts | {"rays": self.tracer.rays - before}
 
     def _by_operator(self, split: str, indices: list[int], todo: list[int], kinds: list[str], stage: Stage) -> None:
         from ddprt.transport.effort import choose_rays

@@ -15,7 +15,8 @@ import numpy as np
 
 from ddprt import harmonics
 from ddprt.axes import Bool, Float32, Float64
-from ddprt.dataset.store import Dataset, Manifest, layer_name
+from ddprt.dataset.manifest import Manifest, layer_name
+from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.files import read_tensors, write_tensors
 

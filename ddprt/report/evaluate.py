@@ -318,11 +318,11 @@ def _bake_variance(brightness: np.ndarray, noise: np.ndarray) -> np.ndarray:
 
 def _frame_by_frame(model: Model, values: np.ndarray) -> tuple[np.ndarray, float]:
     """Unclamped prediction of every frame through the public API, and the median seconds of one, compiled before."""
-    model.predict(values[0], clamp=False)
+    model.predict(values[0], clamp=False, constant=False)
     light, seconds = [], []
     for frame in values:
         start = time.perf_counter()
-        light.append(model.predict(frame, clamp=False))
+        light.append(model.predict(frame, clamp=False, constant=False))
         seconds.append(time.perf_counter() - start)
     return np.stack(light), float(np.median(seconds))
 

@@ -18,8 +18,10 @@ from ddprt.config import Config
 from ddprt.errors import UserError
 from ddprt.lights import LIGHTS, Lighting, parse_lighting
 from ddprt.scene.files import load_scene
+from ddprt.scene.holes import pierced
 from ddprt.scene.material import Gloss, Material
 from ddprt.scene.mesh import Scene
+from ddprt.scene.sheets import backs, without_backs
 from ddprt.transport.embree import Tracer
 
 _FLAT = 1e-6  # of the radius: how far a corner may stand before a triangle's plane and still be in it
@@ -291,12 +293,45 @@ def _gloss_left(question: Question) -> float | None:
     return _lobe_left(question.scene, question.scene.used_materials)
 
 
+def _without_cutouts(scene: Scene) -> Scene:
+    return scene.made_of(lambda material: replace(material, cutout=None) if material.cutout else material)
+
+
+def _two_sided(name: str, question: Question) -> Effect:
+    users = question.users(lambda material: material.two_sided)
+    count = int(np.count_nonzero(backs(question.scene))) if users else 0
+    why = f"{users}: {count} triangles have a back of their own" if count else "no open surface has two sides"
+    return Effect(name, count > 0, why)
+
+
+def _emission(name: str, question: Question) -> Effect:
+    users, used = question.users(_brightest), question.scene.used_materials
+    if not users:
+        return Effect(name, False, "no material emits light")
+    brightest, albedo = max(map(_brightest, used)), max(max(material.albedo) for material in used)
+    bound = f"at most {np.pi * brightest / (1 - albedo):.3g}" if albedo < 1 else "any amount of"
+    return Effect(name, True, f"{users}, {bound} W/m² of irradiance")
+
+
+def _brightest(material: Material) -> float:
+    """Largest radiance that it emits."""
+    part = material.emission
+    return 0.0 if part is None else max(part.radiance) * (1.0 if part.texture is None else float(part.texture.max()))
+
+
+def _without_emission(scene: Scene) -> Scene:
+    return scene.made_of(lambda material: replace(material, emission=None))
+
+
 EFFECTS: Catalogue[Entry] = Catalogue(
     "effect",
     {
         "diffuse bounces": Entry(_diffuse_bounces),
         **{f"{kind} lights": _light_kind(kind) for kind in LIGHTS},
         "gloss": Entry(_gloss, "gloss", _without_gloss, _gloss_left),
+        "cut-outs": Entry(_material(pierced, "no material has holes"), "cutouts", _without_cutouts),
+        "two-sided sheets": Entry(_two_sided, without=without_backs),
+        "emission": Entry(_emission, "emission", _without_emission),
     },
 )
 

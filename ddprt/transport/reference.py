@@ -140,7 +140,7 @@ def _reflected(
     """Pi times the radiance that lobes send out of one sample of every light: what a diffuse surface's radiosity would be."""
     total, origins = np.zeros_like(positions), lifted(tracer, positions, normals)
     for light, numbers in zip(lights, u, strict=True):
-        sample = light.illuminate(origins, numbers)
+        sample = light.illuminate(origins, numbers, None, normals)
         directions = np.ascontiguousarray(sample.direction)
         reach = np.maximum(sample.distance - tracer.offset, 0)
         seen = tracer.unoccluded(origins, directions, reach) != 0

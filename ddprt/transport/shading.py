@@ -2,6 +2,7 @@
 
 import zlib
 from collections.abc import Sequence
+from importlib import import_module
 
 import numpy as np
 
@@ -41,7 +42,7 @@ def shade(
             if not light.delta:
                 np.add(numbers[:2], start[:2, None], out=u)
                 u -= u >= 1
-            sample = light.illuminate(vertices.place[:3].T, u.T, sample)
+            sample = light.illuminate(vertices.place[:3].T, u.T, sample, vertices.place[3:].T)
             if not any(sample.colour):
                 continue
             there = sample.direction.T, sample.distance, sample.strength
@@ -50,7 +51,11 @@ def shade(
             rays = _aim(vertices.place, *there, tracer.offset, *chance, weight, target, origins, directions, reach)
             if rays:
                 seen = tracer.unoccluded(origins[:rays], directions[:rays], reach[:rays])
-                _collect(seen, target, weight, lit.throughput, lit.owner, sample.colour, total)
+                arriving = seen, target, weight, lit.throughput, lit.owner, sample.colour, total
+                if sample.tint is None:
+                    _collect(*arriving)
+                else:
+                    import_module("ddprt.transport.tinted").into_receivers(sample.tint.T, *arriving)
 
 
 def shift(light: Light) -> Float32[np.ndarray, "3"]:
