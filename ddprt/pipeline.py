@@ -196,10 +196,12 @@ class Run:
 
     def export(self, model: Any) -> list[Path]:
         """Writes what engines load."""
+        from ddprt.export.probes import export_probes
         from ddprt.export.textures import export_textures
 
         with self.progress.stage("export"):
             files = export_textures(model, self.folder / "export", **self.config.export.model_dump())
+            export_probes(model, self.folder / "export")
         seams = json.loads(files[-1].read_text())["seams"]
         if self.config.export.stitch and not seams["stitched"]:
             self.progress.warn(f"export.stitch: seams stay open: {seams['why']}")
@@ -219,7 +221,7 @@ class Run:
 
     def effects(self, data: Dataset) -> Plan:
         """The plan that the dataset was baked under."""
-        return plan(self.scene, data.lightings, bounces=self.config.transport.bounces)
+        return plan(self.scene, data.lightings, bounces=self.config.transport.bounces, probes=self.config.probes.asked)
 
     def costs(self, data: Dataset) -> list[dict[str, Any]]:
         """The plan's effects with their rays, seconds and share of the light."""

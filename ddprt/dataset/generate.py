@@ -15,7 +15,7 @@ import numpy as np
 
 from ddprt import __version__, seeds
 from ddprt.config import Config, checked
-from ddprt.dataset import store
+from ddprt.dataset import probes, store
 from ddprt.dataset.denoise import find_denoiser
 from ddprt.dataset.indirect import IndirectBake
 from ddprt.dataset.manifest import Manifest, map_name
@@ -112,6 +112,7 @@ def baked_settings(config: Config, scene: Scene) -> dict[str, Any]:
         "seed": config.seed,
         "transport": transport | {"integrator": valid_integrator(transport["integrator"], scene)},
         "placing": config.points.model_dump(exclude={"quantity"}),
+        "layers": probes.probe_layers(config, scene),
     }
 
 
@@ -128,7 +129,7 @@ def other_settings(description: dict[str, Any], config: Config, scene: Scene) ->
 
 def differences(description: dict[str, Any], wanted: dict[str, Any]) -> str:
     """Where a baked dataset differs from what is asked for: "transport.samples: holds 16, asked 17"; empty if nowhere."""
-    holds = {**description, "counts": _counts(description.get("lightings", []))}
+    holds = {"layers": [], **description, "counts": _counts(description.get("lightings", []))}
     lines: list[str] = []
     for key, value in wanted.items():
         _compare(_SAID.get(key, key), holds.get(key, ...), value, lines)
@@ -236,7 +237,7 @@ class _Bake:
                 entries, samples, shadow_rays = chosen(entries, samples, self.config, self.tracer, self.first, self.once)
                 stage.facts |= {"train": sum(split == "train" for split, _ in entries), "shadow_rays": shadow_rays}
             lightings = [lighting for _, lighting in entries]
-        effects = plan(self.scene, lightings, bounces=self.config.transport.bounces)
+        effects = plan(self.scene, lightings, bounces=self.config.transport.bounces, probes=self.config.probes.asked)
         description = self._description(entries, effects, drawn, samples)
         if description["transport"]["integrator"] != "operator":  # which tells what it left out, if anything
             for effect in (effect for effect in effects.effects if effect.bound is None and not effect.forced):
@@ -273,7 +274,7 @@ class _Bake:
         return {
             "schema": store.SCHEMA,
             "ddprt": __version__,
-            **baked_settings(self.config, self.scene),
+            **{key: value for key, value in baked_settings(self.config, self.scene).items() if value != []},
             "quantity": "irradiance",
             "unit": "W/m2",
             "points": self._points(samples),

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache, cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from ddprt.axes import Float32, Int
 from ddprt.config import Config
 from ddprt.dataset.denoise import denoised
 from ddprt.dataset.manifest import Manifest, map_name
+from ddprt.dataset.probes import ProbeBake, Sent
 from ddprt.dataset.sampled import scratched, stored
 from ddprt.dataset.scratch import Scratch
 from ddprt.dataset.store import CONSTANT, Dataset, read_map, write_map
@@ -52,7 +54,21 @@ class IndirectBake:
         self.constant()
 
     def run(self, split: str, indices: list[int]) -> None:
-        """Bakes the maps of lightings that share their gather rays: "train" (with validation), or "test"."""
+        """Bakes lightings that share their gather rays: "train" (with validation), or "test"."""
+        sent: Callable[[int], Sent] = partial(self._sent, split, indices)
+        if self._probes:
+            sent = cache(sent)  # of maps and probes
+        self._maps(split, indices, sent)
+        if self._probes:
+            dark = self.config.transport.bounces == 0 or not any(max(entry.albedo) for entry in self.scene.materials)
+            self._probes.run(split, indices, sent, self.progress, dark=dark)
+
+    @cached_property
+    def _probes(self) -> ProbeBake | None:
+        scene = self.scene, self.tracer, self.atlas
+        return ProbeBake.of(self.effects, self.config, *scene, self.dataset, self.manifest)
+
+    def _maps(self, split: str, indices: list[int], sent: Callable[[int], Sent]) -> None:
         kinds = ["indirect", "noise"] if split == "test" else ["indirect"]
         todo = self.manifest.lacks(kinds, indices)
         if not todo:
@@ -68,7 +84,7 @@ class IndirectBake:
             elif self.dataset.description["transport"]["integrator"] == "paths":
                 self._by_paths(split, indices, todo, kinds, stage)
             else:
-                self._by_operator(split, indices, todo, kinds, stage)
+                self._by_operator(split, indices, todo, kinds, stage, sent)
             stage.facts["rays"] = self.tracer.rays - before
 
     def constant(self) -> None:
@@ -89,21 +105,38 @@ class IndirectBake:
             self.manifest.add(CONSTANT)
             stage.facts |= found.facts | {"rays": self.tracer.rays - before}
 
-    def _by_operator(self, split: str, indices: list[int], todo: list[int], kinds: list[str], stage: Stage) -> None:
-        from ddprt.transport.effort import choose_rays
+    @cached_property
+    def _operator(self) -> Any:
         from ddprt.transport.operator import Operator
 
+        return Operator.of(self.tracer, self.atlas, self.config.transport.sender_resolution)
+
+    def _sent(self, split: str, indices: list[int], half: int) -> Sent:
+        """What the senders of a half of a split send to its lightings' maps and probes."""
+        operator, stream = self._operator, f"{split} {half}"
+        bounces = self.effects.bounces or 1  # of a lonely convex body, whose light reaches probes alone
+        direct = self._averaged(operator, indices, half)
+        bounced = operator.bounce(direct, seed=self.config.seed, stream=stream, bounces=bounces)
+        near = operator.near([self.dataset.lightings[index] for index in indices], direct, bounces=bounces)
+        return Sent(operator, bounced, {"seed": self.config.seed, "stream": stream, "near": near})
+
+    def _by_operator(
+        self,
+        split: str,
+        indices: list[int],
+        todo: list[int],
+        kinds: list[str],
+        stage: Stage,
+        sent: Callable[[int], Sent],
+    ) -> None:
+        from ddprt.transport.effort import choose_rays
+
         config, test = self.config.transport, split == "test"
-        operator = Operator.of(self.tracer, self.atlas, config.sender_resolution)
-        lightings = [self.dataset.lightings[index] for index in indices]
         parts, rays, footprints = [], None, None
         begun = time.perf_counter()
         for half in range(len(kinds)):
-            stream = f"{split} {half}"
-            direct = self._averaged(operator, indices, half)
-            bounced = operator.bounce(direct, seed=self.config.seed, stream=stream, bounces=self.effects.bounces)
-            near = operator.near(lightings, direct, bounces=self.effects.bounces)
-            address: dict[str, Any] = {"seed": self.config.seed, "stream": stream, "near": near}
+            light = sent(half)
+            operator, bounced, address = light.operator, light.bounced, light.address
             if rays is None:
                 bouncing = time.perf_counter() - begun
                 chosen = choose_rays(operator, bounced.radiosity, config, held_out=test, **address)

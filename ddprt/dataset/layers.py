@@ -88,7 +88,8 @@ def read_layer(data: Dataset, name: str) -> Layer:
     if name not in found:
         raise UserError(f'{data.folder}: got no layer "{name}", expected one of {sorted(found)}; bake with that effect')
     places = read_tensors(data.folder / layer_name(name, "places"))
-    return Layer(**found[name], position=places["position"], weight=places["weight"], texel=places["texel"])
+    kind = {key: found[name][key] for key in ("name", "quantity", "order")}
+    return Layer(**kind, position=places["position"], weight=places["weight"], texel=places["texel"])
 
 
 def layers(data: Dataset) -> list[Layer]:

@@ -108,6 +108,10 @@ def evaluate(data: Dataset, models: Mapping[str, Model], fit_seconds: Mapping[st
             "ridge_chosen_by": report.ridge_chosen_by,
         },
     }
+    if main.layers:
+        from ddprt.report.layers import layer_scores
+
+        metrics["layers"] = layer_scores(data, main)
     evaluation = Evaluation(metrics, truth, values, predicted)
     evaluation.distance = _distance_to_surface(data, main, test)
     return evaluation

@@ -75,11 +75,13 @@ class Question:
     Attributes:
       scene, lightings: of the bake.
       bounces: asked for; -1 lets the scene decide.
+      probes: which are asked for, in words; empty for none.
     """
 
     scene: Scene
     lightings: Sequence[Lighting]
     bounces: int = -1
+    probes: str = ""
 
     def users(self, has: Callable[[Material], object]) -> str:
         """The materials in use that have something, in words; empty where none has."""
@@ -104,16 +106,18 @@ class Entry:
     left: Callable[[Question], float | None] = lambda question: None
 
 
-def plan(scene: Scene, lightings: Sequence[Lighting], *, bounces: int = -1) -> Plan:
+def plan(scene: Scene, lightings: Sequence[Lighting], *, bounces: int = -1, probes: str = "") -> Plan:
     """Decides what to simulate.
 
     Args:
       scene: its materials and shape; from `force` where the user decides.
       lightings: all that will be baked.
       bounces: -1 lets the scene decide; 0 and up is forced.
+      probes: which are asked for, in words (`config.probes.asked`); empty for none.
     """
     parsed = [parse_lighting(lighting, f"lighting {index}") for index, lighting in enumerate(lightings)]
-    effects = tuple(_decided(name, entry, Question(scene, parsed, bounces)) for name, entry in EFFECTS.items())
+    question = Question(scene, parsed, bounces, probes)
+    effects = tuple(_decided(name, entry, question) for name, entry in EFFECTS.items())
     return Plan(effects, bounces if effects[0].called else 0)
 
 
@@ -137,7 +141,9 @@ def force(scene: Scene, *, on: Sequence[str] = (), off: Sequence[str] = ()) -> S
     for name in off:
         without = EFFECTS[name].without
         left = without(left) if without else left
-    return replace(left, whole=whole if left is not whole else None, forced=tuple(sorted({*scene.forced, *on})))
+    forced, refused = ({*said} - {*other} for said, other in (((*scene.forced, *on), off), ((*scene.refused, *off), on)))
+    cut = whole if left is not whole else None
+    return replace(left, whole=cut, forced=tuple(sorted(forced)), refused=tuple(sorted(refused)))
 
 
 def configured_scene(config: Config) -> Scene:
@@ -147,6 +153,8 @@ def configured_scene(config: Config) -> Scene:
 
 def _decided(name: str, entry: Entry, question: Question) -> Effect:
     effect, whole = entry.decide(name, question), question.scene.whole
+    if effect.called and name in question.scene.refused:  # by the settings: there was nothing to take out of the scene
+        return Effect(name, False, f"forced off, though it is called for: {effect.why}", entry.left(question), True)
     if effect.called:
         return effect
     if name in question.scene.forced:
@@ -323,6 +331,16 @@ def _without_emission(scene: Scene) -> Scene:
     return scene.made_of(lambda material: replace(material, emission=None))
 
 
+def _probes(name: str, question: Question) -> Effect:
+    asked = question.probes
+    return Effect(name, bool(asked), f"the configuration asks for {asked}" if asked else "the configuration asks for none")
+
+
+def probed(config: Config, scene: Scene) -> bool:
+    """Whether a bake has probes, without the rest of its plan."""
+    return _decided("probes", EFFECTS["probes"], Question(scene, (), probes=config.probes.asked)).called
+
+
 EFFECTS: Catalogue[Entry] = Catalogue(
     "effect",
     {
@@ -332,6 +350,7 @@ EFFECTS: Catalogue[Entry] = Catalogue(
         "cut-outs": Entry(_material(pierced, "no material has holes"), "cutouts", _without_cutouts),
         "two-sided sheets": Entry(_two_sided, without=without_backs),
         "emission": Entry(_emission, "emission", _without_emission),
+        "probes": Entry(_probes, "probes", lambda scene: scene, lambda question: 0.0),  # no lightmap has light from them
     },
 )
 
