@@ -12,7 +12,8 @@ import numpy as np
 from ddprt import __version__
 from ddprt.config import Config
 from ddprt.dataset.forecast import Forecast, forecast
-from ddprt.dataset.generate import bake, other_settings
+from ddprt.dataset.generate import bake
+from ddprt.dataset.sameness import other_settings
 from ddprt.dataset.store import Dataset, open_dataset
 from ddprt.errors import UserError
 from ddprt.files import make_folder, write_text
@@ -21,6 +22,7 @@ from ddprt.machine import machine, peak_memory_gib
 from ddprt.progress import Progress
 from ddprt.scene.mesh import Scene
 from ddprt.transport.effects import Plan, configured_scene, plan
+from ddprt.transport.glossiness import valid_integrator
 
 _AFTER_BAKE = ("fit", "evaluate", "bases curve", "spot check", "report", "export")
 
@@ -168,7 +170,10 @@ class Run:
         from ddprt.bench.budget.bakes import Bakery
         from ddprt.bench.budget.budget import measure_budget
 
-        bakery = Bakery(self.scene, self.config, data, self.folder / "budget", self.progress)
+        # What "auto" takes is told, since causes of error and knobs depend on it.
+        chosen = {"integrator": valid_integrator(self.config.transport.integrator, self.scene)}
+        config = self.config.model_copy(update={"transport": self.config.transport.model_copy(update=chosen)})
+        bakery = Bakery(self.scene, config, data, self.folder / "budget", self.progress)
         model = next(iter(models.values()))
         document = record(measure_budget(model, bakery), model, bakery)
         write_text(self.folder / "budget.json", json.dumps(document, indent=1, allow_nan=False) + "\n")

@@ -15,6 +15,7 @@ from ddprt.dataset.store import Dataset, read_description
 from ddprt.errors import UserError
 from ddprt.progress import Progress
 from ddprt.scene.mesh import Scene
+from ddprt.sections import ProbesConfig
 
 FIRST_GROUP = 16
 """Lightings of the first group; each group is twice the one before."""
@@ -40,7 +41,7 @@ def bake_to_target(scene: Scene, config: Config, folder: Path, progress: Progres
     if count is None:
         count = sizes[-1]
         fewest = config.transport.model_copy(update={"test_samples": _FEWEST})
-        rough = config.model_copy(update={"transport": fewest})
+        rough = config.model_copy(update={"transport": fewest, "probes": ProbesConfig()})  # nothing looks at their probes
         for size in sizes[:-1]:
             trial = bake(scene, config=rough, out=trials / f"{size:06d}", first=size, once=once, progress=progress)
             if _told(trial, config, progress) <= target:

@@ -21,7 +21,8 @@ def describe(source: str, overrides: dict[str, str]) -> str:
       source: a configuration, a scene name or a mesh file.
       overrides: of the configuration.
     """
-    from ddprt.dataset.generate import baked_settings, check_points
+    from ddprt.dataset.generate import check_points
+    from ddprt.dataset.sameness import baked_settings
     from ddprt.transport.effects import configured_scene, plan
     from ddprt.transport.embree import Tracer
     from ddprt.transport.openness import build_open_atlas

@@ -20,7 +20,8 @@ from hypothesis import strategies as st
 
 from ddprt import pipeline_active
 from ddprt.config import Config
-from ddprt.dataset.generate import bake, other_settings
+from ddprt.dataset.generate import bake
+from ddprt.dataset.sameness import other_settings
 from ddprt.dataset.splits import Once, choose_among, reorder
 from ddprt.dataset.store import Dataset, open_dataset
 from ddprt.errors import UserError

@@ -17,7 +17,7 @@ from ddprt.scene.library import build
 from ddprt.scene.material import Material
 from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import faceted, icosphere, rectangle
-from ddprt.transport import paths
+from ddprt.transport import shading
 from ddprt.transport.embree import Tracer
 from ddprt.transport.paths import choose_samples, trace_paths
 from ddprt.transport.reference import Estimate, on_texels, trace_reference
@@ -267,8 +267,8 @@ def test_roulette_of_shadow_rays_changes_no_mean(
     share: float, cornell: Scene, cornell_atlas: Atlas, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """None at all, and so much that most light is left to it."""
-    monkeypatch.setattr(paths, "_aim", getattr(paths._aim, "py_func", paths._aim))
-    monkeypatch.setattr(paths, "_FAINT", share)
+    monkeypatch.setattr(shading, "_aim", getattr(shading._aim, "py_func", shading._aim))
+    monkeypatch.setattr(shading, "_FAINT", share)
     chosen = np.arange(0, cornell_atlas.count, 40)
     area = np.zeros(cornell_atlas.count)
     area[chosen] = cornell_atlas.area[chosen]

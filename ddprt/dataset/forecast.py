@@ -31,8 +31,9 @@ from ddprt.config import Config
 from ddprt.dataset import store
 from ddprt.dataset.denoise import find_denoiser
 from ddprt.dataset.forecast_indirect import expect_indirect
-from ddprt.dataset.generate import baked_settings, check_points, sunk
+from ddprt.dataset.generate import check_points, sunk
 from ddprt.dataset.manifest import Manifest, map_name
+from ddprt.dataset.sameness import baked_settings
 from ddprt.dataset.sampled import Expected, Part, Sampled
 from ddprt.dataset.splits import choose_lightings, doubt
 from ddprt.dataset.store import ATLAS_FILES
@@ -46,6 +47,7 @@ from ddprt.scene.unwrap import unwrap
 from ddprt.transport.direct import Texels
 from ddprt.transport.effects import plan
 from ddprt.transport.embree import Tracer
+from ddprt.transport.glossiness import scattering
 from ddprt.transport.measure import measure
 from ddprt.transport.openness import build_open_atlas
 
@@ -148,7 +150,7 @@ def _foreseen(scene: Scene, config: Config, folder: Path, progress: Progress, be
     between += time.perf_counter() - begun
     unwrap(scene, config.atlas.resolution, config.atlas.padding)  # kept for the bake, which finds it there
     begun = time.perf_counter()
-    atlas, _ = build_open_atlas(tracer, scene, config.atlas.resolution, config.atlas.padding)
+    atlas, _ = build_open_atlas(tracer, scattering(scene), config.atlas.resolution, config.atlas.padding)
     begun = staged("atlas")
     peak = peak_memory_gib() or 0.0
     samples = listed

@@ -15,6 +15,7 @@ from ddprt.dataset.sampled import Expected, Number, Part, Sampled, extrapolated,
 from ddprt.dataset.store import read_map, write_map
 from ddprt.lights import Lighting
 from ddprt.transport.direct import Texels
+from ddprt.transport.glossiness import valid_integrator
 
 _WIDE = 512  # lightings whose columns are really made
 _BLOCK = 16  # rows of an EXR that are compressed together
@@ -51,7 +52,7 @@ def expect_indirect(job: Sampled, split: str, indices: list[int], seen: list[int
       indices: its lightings.
       seen: those whose direct light lies in the folder, in rising order.
     """
-    integrator, parts = job.config.transport.integrator, list[Part]()
+    integrator, parts = valid_integrator(job.config.transport.integrator, job.scene), list[Part]()
     kinds = ["indirect", "noise"] if split == "test" else ["indirect"]
     seconds, rays, look = 0.0, 0, None
     if job.bounces:

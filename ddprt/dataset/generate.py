@@ -4,7 +4,6 @@ What a stage needs is read back from the files of the stage before it, never fro
 gives the same bits as one that was never stopped.
 """
 
-import json
 import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -15,12 +14,13 @@ import numpy as np
 
 from ddprt import __version__, seeds
 from ddprt.config import Config, checked
-from ddprt.dataset import probes, store
+from ddprt.dataset import store
 from ddprt.dataset.denoise import find_denoiser
 from ddprt.dataset.indirect import IndirectBake
 from ddprt.dataset.manifest import Manifest, map_name
+from ddprt.dataset.sameness import baked_settings, counts, differences, pictures
 from ddprt.dataset.scratch import remove_left
-from ddprt.dataset.splits import SPLITS, Once, Splits, check_choice, choose_lightings, chosen, doubt, grouped
+from ddprt.dataset.splits import Once, Splits, check_choice, choose_lightings, chosen, doubt, grouped
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.files import alone_in, write_tensors
@@ -33,14 +33,12 @@ from ddprt.sections import PointsConfig
 from ddprt.transport.direct import Texels
 from ddprt.transport.effects import Plan, plan
 from ddprt.transport.embree import Tracer
+from ddprt.transport.glossiness import scattering
 from ddprt.transport.measure import measure
 from ddprt.transport.openness import build_open_atlas
 
 DEPTH = 0.75  # of the distance between samples: what they mistake for a constant shrinks to 1.8 %
 _NAMED = 8  # doubtful lightings, or altered files, that a message spells out
-_TOLD = 4  # settings that differ and that a message spells out
-_WIDTH = 60  # characters of a value in a message
-_SAID = {"placing": "points", "counts": "lightings"}  # what dataset.json calls otherwise than the configuration does
 
 
 def bake(
@@ -101,64 +99,6 @@ def bake(
     keep_alive = tempfile.TemporaryDirectory(prefix="ddprt-") if out is None else None
     folder = Path(keep_alive.name if keep_alive else str(out))
     return _Bake(scene, config, folder, progress or Progress(quiet=True), first, once or Once()).run(lightings, keep_alive)
-
-
-def baked_settings(config: Config, scene: Scene) -> dict[str, Any]:
-    """What a dataset depends on besides its lightings and points."""
-    transport = config.transport.model_dump(exclude={"threads"})
-    return {
-        "scene": {"name": scene.name, "digest": scene.digest, "notes": list(scene.notes)},
-        "atlas": config.atlas.model_dump(),
-        "seed": config.seed,
-        "transport": transport | {"integrator": "operator" if transport["integrator"] == "auto" else transport["integrator"]},
-        "placing": config.points.model_dump(exclude={"quantity"}),
-        "layers": probes.probe_layers(config, scene),
-    }
-
-
-def other_settings(description: dict[str, Any], config: Config, scene: Scene) -> str:
-    """The settings in which a baked dataset differs from a configuration, in words; empty where it is the same."""
-    wanted: dict[str, Any] = baked_settings(config, scene)
-    if not config.lightings.file:
-        wanted["counts"] = {name: getattr(config.lightings, name) for name in SPLITS}
-        baked = _counts(description.get("lightings", []))["train"]
-        if config.lightings.target_error and 0 < baked < config.lightings.train:  # it was reached by so many
-            wanted["counts"]["train"] = baked
-    return differences(description, wanted)
-
-
-def differences(description: dict[str, Any], wanted: dict[str, Any]) -> str:
-    """Where a baked dataset differs from what is asked for: "transport.samples: holds 16, asked 17"; empty if nowhere."""
-    holds = {"layers": [], **description, "counts": _counts(description.get("lightings", []))}
-    lines: list[str] = []
-    for key, value in wanted.items():
-        _compare(_SAID.get(key, key), holds.get(key, ...), value, lines)
-    more = [f"and {len(lines) - _TOLD} more"] if len(lines) > _TOLD else []
-    return "; ".join(lines[:_TOLD] + more)
-
-
-def _counts(entries: Sequence[dict[str, Any]]) -> dict[str, int]:
-    splits = [entry["split"] for entry in entries]
-    return {name: splits.count(name) for name in SPLITS}
-
-
-def _compare(name: str, holds: Any, asked: Any, lines: list[str]) -> None:
-    """Adds a line for every leaf that differs; the ellipsis stands for what is not there."""
-    if isinstance(holds, dict) and isinstance(asked, dict):
-        for key in dict.fromkeys([*asked, *holds]):
-            _compare(f"{name}.{key}", holds.get(key, ...), asked.get(key, ...), lines)
-    elif isinstance(holds, list) and isinstance(asked, list) and len(holds) == len(asked):
-        for index, (one, other) in enumerate(zip(holds, asked, strict=True)):
-            _compare(f"{name}[{index}]", one, other, lines)
-    elif holds != asked:
-        lines.append(f"{name}: holds {_shown(holds)}, asked {_shown(asked)}")
-
-
-def _shown(value: Any) -> str:
-    words = "nothing" if value is ... else json.dumps(value)
-    if len(words) <= _WIDTH:
-        return words
-    return f"a list of {len(value)}" if isinstance(value, list) else f"{words[: _WIDTH // 2]}...{words[-_WIDTH // 2 :]}"
 
 
 def check_points(config: Config, scene: Scene, atlas: Atlas) -> None:
@@ -224,9 +164,10 @@ class _Bake:
         active = self.config.lightings.choose == "active"
         if there is not None and not active:
             points = {"points": self._points(listed)} if listed else {}
-            self._refuse_other(there, {"counts": _counts(_records(entries)), "lightings": _records(entries), **points})
+            self._refuse_other(there, {"counts": counts(_records(entries)), "lightings": _records(entries), **points})
         with self.progress.stage("atlas") as stage:
-            atlas, hidden = build_open_atlas(self.tracer, self.scene, self.config.atlas.resolution, self.config.atlas.padding)
+            size = self.config.atlas
+            atlas, hidden = build_open_atlas(self.tracer, scattering(self.scene), size.resolution, size.padding)
             stage.facts |= {"texels": atlas.count, "texels_per_metre": float(f"{atlas.texels_per_metre:.4g}"), **hidden}
         with self.progress.stage("points") as stage:
             samples = listed or self._sunk(self._placed(atlas), lightings)
@@ -237,11 +178,10 @@ class _Bake:
                 stage.facts |= {"train": sum(split == "train" for split, _ in entries), "shadow_rays": shadow_rays}
             lightings = [lighting for _, lighting in entries]
         effects = plan(self.scene, lightings, bounces=self.config.transport.bounces, probes=self.config.probes.asked)
-        if self.config.transport.integrator in ("paths", "reference"):  # the operator tells what it left out, if anything
-            for effect in effects.effects:
-                if effect.bound is None and not effect.forced:
-                    self.progress.warn(f"{effect.name}: {effect.why}")
         description = self._description(entries, effects, drawn, samples)
+        if description["transport"]["integrator"] != "operator":  # which tells what it left out, if anything
+            for effect in (effect for effect in effects.effects if effect.bound is None and not effect.forced):
+                self.progress.warn(f"{effect.name}: {effect.why}")
         if there is None:
             (self.folder / "manifest.jsonl").unlink(missing_ok=True)  # it tells of a dataset that nobody knows any more
             store.write_description(self.folder, description)
@@ -281,6 +221,7 @@ class _Bake:
             "plan": [asdict(effect) for effect in effects.effects],
             "drawn": drawn,
             "lightings": _records(entries),
+            **({"skies": skies} if (skies := pictures([lighting for _, lighting in entries])) else {}),
         }
 
     def _points(self, samples: Samples) -> dict[str, Any]:

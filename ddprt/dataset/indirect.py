@@ -247,9 +247,10 @@ class IndirectBake:
             given, noise = choose_samples(*scene, target=config.target_noise, stream=stream, **shared)
             stage.facts["noise_expected"] = float(f"{noise:.3g}")
             if noise > 1.5 * config.target_noise:
+                other = "force gloss off" if self.effects.called("gloss") else "use the operator"
                 self.progress.warn(
                     f"{given} paths per texel leave about {100 * noise:.2g} % of noise, and no more are traced "
-                    "unasked; set transport.samples, raise transport.target_noise, or use the operator"
+                    f"unasked; set transport.samples, raise transport.target_noise, or {other}"
                 )
         samples = max(1, given // halves)
         stage.facts["samples"] = samples * halves

@@ -23,6 +23,7 @@ from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
 from ddprt.transport.effects import Plan, probed
 from ddprt.transport.embree import Tracer
+from ddprt.transport.glossiness import valid_integrator
 
 NAME = "probes"
 _NAMED = 8  # probes that a message spells out
@@ -51,10 +52,13 @@ def probe_layers(config: Config, scene: Scene) -> list[dict[str, Any]]:
     """
     if not probed(config, scene):
         return []
-    if config.transport.integrator not in ("auto", "operator"):
+    integrator = valid_integrator(config.transport.integrator, scene)
+    if integrator != "operator":
+        asked = config.transport.integrator
+        why = f'"{asked}"' if integrator == asked else f'"{asked}", which takes "{integrator}" for what glosses'
         raise UserError(
-            f'transport.integrator: got "{config.transport.integrator}", which knows no probes, expected "auto" or "operator"; '
-            'set one of them, or effects.off = ["probes"]'
+            f"transport.integrator: got {why} and knows no probes, expected the operator; set effects.off = "
+            f'["{"probes" if integrator == asked else "gloss"}"]'
         )
     probes = import_module("ddprt.transport.probes")
     position = probes.places(config.probes, scene.bounds)

@@ -10,7 +10,7 @@ from ddprt.catalogue import Catalogue
 from ddprt.errors import UserError, nearest
 from ddprt.scene.checks import checked, vertex_normals
 from ddprt.scene.cornell import cornell, cornell_hole
-from ddprt.scene.material import Cutout, Emission, Material
+from ddprt.scene.material import Cutout, Emission, Gloss, Material
 from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import box, faceted, hollow, icosphere, rectangle
 
@@ -152,6 +152,45 @@ def faults(*, albedo: float = 0.7, thickness: float = 0.003, gap: float = 0.004)
     return faceted("faults", np.concatenate(quads), (Material("grey", (albedo,) * 3),))
 
 
+def glossy_room(*, roughness: float = 0.25, metallic: float = 1.0, around: int = 24) -> Scene:
+    """The Cornell box with a golden vase in place of its short block: one glossy thing in a diffuse room.
+
+    Args:
+      roughness: of the vase.
+      metallic: of the vase; 0 makes a glazed yellow pot.
+      around: facets of the vase in a ring, at least 3.
+    Raises:
+      UserError: too few facets.
+    """
+    if around < 3:
+        raise UserError(f"glossy-room.around: got {around}, expected at least 3; a vase is round")
+    room = cornell()
+    kept = np.r_[0:8, 18:30]  # the short block is five quads after the four walls
+    used, walls = np.unique(room.triangles[kept], return_inverse=True)
+    height = np.linspace(0.0, 1.0, 13)
+    reach = 0.075 * (0.62 + 0.42 * np.sin(2.3 * np.pi * height**0.8 - 0.35) * (1 - 0.45 * height))
+    angle = 2 * np.pi * np.arange(around) / around
+    rim = np.stack([np.cos(angle), np.zeros(around), np.sin(angle)], 1)
+    rings = reach[:, None, None] * rim + (0.24 * height[:, None] * [0.0, 1.0, 0.0])[:, None]
+    vase = np.append(rings.reshape(-1, 3), [[0.0, 0.24, 0.0]], axis=0) + np.array([0.186, 0.0, 0.169])
+    low = (around * np.arange(12)[:, None] + np.arange(around)).ravel()
+    after = (around * np.arange(12)[:, None] + (np.arange(around) + 1) % around).ravel()
+    top, last = len(vase) - 1, 12 * around + np.arange(around)
+    lid = np.stack([last, np.full(around, top), np.roll(last, -1)], 1)
+    faces = np.concatenate([np.stack([low, low + around, after], 1), np.stack([after, low + around, after + around], 1), lid])
+    material = Material("gilt", (0.9, 0.65, 0.3), gloss=Gloss(roughness, metallic))
+    positions = np.concatenate([room.positions[used], np.round(vase, 9)])  # sines differ in their last bit among machines
+    triangles = np.concatenate([walls.reshape(-1, 3), faces + len(used)])
+    return checked(
+        "glossy-room",
+        positions,
+        triangles,
+        normals=vertex_normals(positions, triangles),
+        material=np.concatenate([room.material[kept], np.full(len(faces), len(room.materials))]),
+        materials=(*room.materials, material),
+    )
+
+
 def neon(*, radiance: float = 40.0, albedo: float = 0.7) -> Scene:
     """A small room with a glowing sign: LIT in bars before the back wall, two letters pink and one blue, and a table.
 
@@ -254,6 +293,7 @@ SCENES: Catalogue[Callable[..., Scene]] = Catalogue(
         "statue": statue,
         "convex": convex,
         "faults": faults,
+        "glossy-room": glossy_room,
         "leaves": leaves,
         "neon": neon,
     },

@@ -23,6 +23,7 @@ from ddprt.scene.material import Material
 from ddprt.scene.mesh import Scene
 from ddprt.scene.sheets import backs, without_backs
 from ddprt.sections import TransportConfig
+from ddprt.transport.glossiness import glossy, lobe_left, worth_gloss
 
 _FLAT = 1e-6  # of the radius: how far a corner may stand before a triangle's plane and still be in it
 _CHUNK = 1 << 22
@@ -214,7 +215,7 @@ def _diffuse_bounces(name: str, question: Question) -> Effect:
     bounces = question.bounces
     brightest = max(question.scene.materials, key=lambda material: max(material.albedo))
     albedo = max(brightest.albedo)
-    if albedo == 0:
+    if albedo == 0 and not any(glossy(question.scene)):
         return Effect(name, False, "every material is black")
     if sees_nothing(question.scene):
         return Effect(name, False, "no surface faces another: the scene is convex seen from outside")
@@ -255,6 +256,32 @@ def _material(has: Callable[[Material], object], lacking: str) -> Callable[[str,
         return Effect(name, bool(users), users or lacking)
 
     return decide
+
+
+def _gloss(name: str, question: Question) -> Effect:
+    scene = question.scene
+    rough = [
+        entry
+        for entry, chosen in zip(scene.materials, glossy(scene), strict=True)
+        if entry.gloss and entry in scene.used_materials and not chosen
+    ]
+    left = lobe_left(scene, rough)
+    users = question.users(worth_gloss)
+    if users:
+        return Effect(name, True, users, left)
+    if rough:
+        return Effect(
+            name, False, f"{question.users(lambda entry: entry.gloss)} too rough: less bright than a white wall", left
+        )
+    return Effect(name, False, "no material has any")
+
+
+def _without_gloss(scene: Scene) -> Scene:
+    return scene.made_of(lambda material: replace(material, gloss=None) if material.gloss else material)
+
+
+def _gloss_left(question: Question) -> float | None:
+    return lobe_left(question.scene, question.scene.used_materials)
 
 
 def _without_cutouts(scene: Scene) -> Scene:
@@ -302,6 +329,7 @@ EFFECTS: Catalogue[Entry] = Catalogue(
     {
         "diffuse bounces": Entry(_diffuse_bounces, cost=_gathered),
         **{f"{kind} lights": _light_kind(kind) for kind in LIGHTS},
+        "gloss": Entry(_gloss, "gloss", _without_gloss, _gloss_left),
         "cut-outs": Entry(_material(pierced, "no material has holes"), "cutouts", _without_cutouts),
         "two-sided sheets": Entry(_two_sided, without=without_backs),
         "emission": Entry(_emission, "emission", _without_emission),

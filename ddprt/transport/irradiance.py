@@ -11,6 +11,7 @@ from ddprt.lights import Light, Lighting, parse_lighting
 from ddprt.scene.checks import FARTHEST
 from ddprt.scene.mesh import Scene
 from ddprt.transport.embree import Tracer
+from ddprt.transport.glossiness import glossy
 from ddprt.transport.reference import on_points, trace_reference
 
 
@@ -54,8 +55,9 @@ def irradiance(
         raise UserError(f"samples: got {samples}, expected at least {1 + return_variance}")
     parsed = parse_lighting(lighting)
     tracer = Tracer.of(scene)
-    # A probe may float in free air, where even a convex scene sends light to it: only black scenes end at direct light.
-    black = all(max(material.albedo) == 0 for material in scene.materials)
+    # A probe may float in free air, where even a convex scene sends light to it: only black scenes end at direct light, if
+    # they do not gloss.
+    black = all(max(material.albedo) == 0 for material in scene.materials) and not any(glossy(scene))
     start = on_points(tracer, place, facing)
     estimate = trace_reference(tracer, scene, parsed, start, len(place), samples, seed=seed, bounces=0 if black else -1)
     if return_variance:

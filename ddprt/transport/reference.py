@@ -7,6 +7,7 @@ hit sends L = albedo * E_hit / pi; so one path contributes the sum over its vert
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
 from ddprt.transport.direct import centred, direct_irradiance
 from ddprt.transport.embree import Tracer, lifted
+from ddprt.transport.glossiness import glossy_surfaces
 
 _BATCH = 1 << 15  # paths traced together
 _MAX_SURVIVAL = 0.999  # a white closed room would never let a path go; a lower cap has no finite variance above its root
@@ -57,7 +59,7 @@ def trace_reference(
       seed: of the paths; equal seeds give equal bits whatever the number of threads.
       bounces: -1 follows every path to its end by roulette; otherwise at most this many.
     """
-    lights = centred(tracer, lighting)
+    lights, gloss = centred(tracer, lighting), glossy_surfaces(tracer, scene)
     block = max(1, _BATCH // samples)
     rounds = -(-samples // _BATCH)
 
@@ -68,7 +70,7 @@ def trace_reference(
             rng = seeds.stream(seed, "reference", first, turn)
             paths = min(_BATCH, samples - turn * _BATCH)
             index = np.repeat(np.arange(first, first + count), paths)
-            values = np.stack(_paths(tracer, scene, lights, start(index, rng), rng, bounces), 1)
+            values = np.stack(_paths(tracer, scene, lights, start(index, rng), rng, bounces, gloss), 1)
             values = values.reshape(count, paths, 2, 3).astype(np.float64)
             sums += values.sum(1)
             squares += (values**2).sum(1)
@@ -88,6 +90,7 @@ def _paths(
     start: tuple[np.ndarray, np.ndarray],
     rng: np.random.Generator,
     bounces: int,
+    gloss: Any,
 ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
     """Direct and indirect contribution of one path each."""
     positions, normals = start
@@ -95,22 +98,56 @@ def _paths(
     indirect = np.zeros_like(direct)
     alive = np.arange(len(positions))
     throughput = np.ones_like(direct)
-    depth = 0
+    depth, shiny, lobes = 0, np.zeros(0, np.intp), None
     while len(alive) and depth != bounces:
         frames = warp.frame(normals)
         directions = warp.to_world(warp.sample_cosine(rng.random((len(alive), 2), np.float32)), frames)
+        if lobes:
+            directions[shiny], weight = lobes.scattered(rng.random((len(shiny), 3), np.float32))
         hits = tracer.closest(lifted(tracer, positions, normals), directions)
         albedo = _albedo(scene, hits.triangle, hits.u, hits.v)
+        if gloss:
+            albedo[gloss.shiny[hits.triangle]] = 1  # what it reflects is told by direction, below
+        if lobes:
+            albedo[shiny] *= weight
         survival = np.minimum(albedo.max(1), _MAX_SURVIVAL)
         keep = np.flatnonzero(hits.front & (rng.random(len(alive), np.float32) < survival))
         alive, triangle = alive[keep], hits.triangle[keep]
         throughput = throughput[keep] * albedo[keep] / survival[keep, None]
         normals = tracer.normals[triangle]
         positions = tracer.on_triangle(triangle, hits.u[keep], hits.v[keep])
-        light = direct_irradiance(tracer, lights, positions, normals, _numbers(rng, len(lights), len(alive)))
+        numbers = _numbers(rng, len(lights), len(alive))
+        light = direct_irradiance(tracer, lights, positions, normals, numbers)
+        if gloss:
+            shiny = np.flatnonzero(gloss.shiny[triangle])
+            where = triangle[shiny], hits.u[keep][shiny], hits.v[keep][shiny]
+            lobes = gloss.lobes(*where, directions[keep][shiny]) if len(shiny) else None
+        if lobes:
+            light[shiny] = _reflected(tracer, lights, positions[shiny], normals[shiny], lobes, numbers[:, shiny])
         indirect[alive] += throughput * light
         depth += 1
     return direct, indirect
+
+
+def _reflected(
+    tracer: Tracer,
+    lights: Lighting,
+    positions: Float32[np.ndarray, "n 3"],
+    normals: Float32[np.ndarray, "n 3"],
+    lobes: Any,
+    u: Float32[np.ndarray, "lights n 2"],
+) -> Float32[np.ndarray, "n 3"]:
+    """Pi times the radiance that lobes send out of one sample of every light: what a diffuse surface's radiosity would be."""
+    total, origins = np.zeros_like(positions), lifted(tracer, positions, normals)
+    for light, numbers in zip(lights, u, strict=True):
+        sample = light.illuminate(origins, numbers, None, normals)
+        directions = np.ascontiguousarray(sample.direction)
+        reach = np.maximum(sample.distance - tracer.offset, 0)
+        seen = tracer.unoccluded(origins, directions, reach) != 0
+        cosine = np.einsum("nd,nd->n", normals, directions)
+        lit = np.flatnonzero(seen & (cosine > 0))
+        total[lit] += np.pi * lobes.reflected(directions)[lit] * sample.irradiance[lit]
+    return total
 
 
 def _numbers(rng: np.random.Generator, lights: int, count: int) -> Float32[np.ndarray, "lights n 2"]:

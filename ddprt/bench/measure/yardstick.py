@@ -88,9 +88,8 @@ def _lightings(scene: Scene, config: Config, tracer: Tracer) -> dict[str, list[A
 def _transport(config: Config) -> Any:
     """Held-out maps as finely as `bench.noise` asks, training maps as cheaply as can be."""
     cheap = {"samples": 1, "footprint": 0.0, "adaptive": False, "denoise": False}
-    chosen = "operator" if config.transport.integrator == "auto" else config.transport.integrator
-    fine: dict[str, Any] = {"integrator": chosen, "target_noise": config.bench.noise}
-    if chosen != "reference":  # it knows no target, and goes by the samples that it is told
+    fine: dict[str, Any] = {"target_noise": config.bench.noise}
+    if config.transport.integrator != "reference":  # it knows no target, and goes by the samples that it is told
         fine["test_samples"] = "auto"
     return config.transport.model_copy(update=cheap | fine)
 

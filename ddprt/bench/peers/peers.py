@@ -188,7 +188,7 @@ def _summary(comparisons: Sequence[dict[str, Any]]) -> dict[str, float | None]:
     one, batch = ours("transfer, one frame"), ours("transfer, batch")
     return {
         "fit_speedup_best_peer": by_name["fit"]["speedup_best_peer"],
-        "fit_over_gram": float(f"{1 / gram:.4g}"),
+        "fit_over_gram": None if gram is None else float(f"{1 / gram:.4g}"),
         "relight_bandwidth_fraction": ours("relight, cold")["share_of_limit"],
         "relight_bandwidth_fraction_warm": ours("relight, warm")["share_of_limit"],
         "relight_speedup_best_peer": by_name["relight, cold"]["speedup_best_peer"],
