@@ -77,7 +77,8 @@ def validation_error(data: Dataset, config: Config) -> float:
     from ddprt.runtime.train import fit_config
 
     model, held = fit_config(data, config, config.fit.method), data.split("validation")
-    light = model.predict(data.values(held, model.points, config.points.quantity))
+    lightings = [data.lightings[index] for index in held]
+    light = model.predict(data.values(held, model.points, config.points.quantity), lightings=lightings)
     truth = Truth(data.maps("indirect", held), data.area)
     error = truth.relative_rmse(light - truth.reference)
     return float("inf") if error is None else error

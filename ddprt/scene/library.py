@@ -10,6 +10,7 @@ from ddprt.catalogue import Catalogue
 from ddprt.errors import UserError, nearest
 from ddprt.scene.checks import checked, vertex_normals
 from ddprt.scene.cornell import cornell, cornell_hole
+from ddprt.scene.lion import lion
 from ddprt.scene.material import Material
 from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import box, faceted, hollow, icosphere, rectangle
@@ -171,6 +172,7 @@ SCENES: Catalogue[Callable[..., Scene]] = Catalogue(
         "statue": statue,
         "convex": convex,
         "faults": faults,
+        "lion": lion,
     },
 )
 
