@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64
@@ -27,7 +28,7 @@ from pydantic import Field
 
 from ddprt.errors import UserError
 from ddprt.fitting.basis import entry_weights
-from ddprt.fitting.selection import RANK_CUT, choose_ridge, decompose
+from ddprt.fitting.selection import RANK_CUT, Spectrum, choose_ridge, decompose
 from ddprt.fitting.transfer import solve_transfer
 from ddprt.harmonics import count, harmonics
 from ddprt.methods.method import (
@@ -118,12 +119,8 @@ class ShPrt(Method):
         size = np.linalg.norm(described, axis=1)
         X, relative = described / _positive(size)[:, None], scale / _positive(size)
         lit = [np.flatnonzero(size[:, channel] > 0) for channel in range(3)]
-        spectra = [
-            decompose(X[rows, :, c], _coordinates(light[rows, :, c] * relative[rows, c, None] * root))
-            for c, rows in enumerate(lit)
-            if len(rows)
-        ]
         seen = [c for c in range(3) if len(lit[c])]
+        spectra = [_spectrum(X[lit[c], :, c], light[lit[c], :, c] * relative[lit[c], c, None] * root) for c in seen]
         weight = [size[lit[c], c] ** 2 for c in seen]
         choice = choose_ridge(spectra, weight, [lit[c] for c in seen]) if self.ridge == "auto" and seen else None
         ridge = choice.ridge if choice else self.ridge if self.ridge != "auto" else 0.0
@@ -169,10 +166,11 @@ def window(name: str, order: int) -> Float64[np.ndarray, " harmonics"]:
     return np.repeat(shapes[name], 2 * band + 1)
 
 
-def _coordinates(rows: Float64[np.ndarray, "lightings texels"]) -> Float64[np.ndarray, "lightings lightings"]:
-    """Rows as few numbers, with the same products: all that leaving one out asks of them."""
-    values, vectors = np.linalg.eigh(rows @ rows.T)
-    return vectors * np.sqrt(np.maximum(values, 0))
+def _spectrum(X: Float64[np.ndarray, "lightings harmonics"], light: Float64[np.ndarray, "lightings texels"]) -> Spectrum:
+    """The problem with rows of light told by a few numbers of the same products: all that leaving one out asks of them."""
+    values, vectors = np.linalg.eigh(light @ light.T)
+    with jax.enable_x64(True):
+        return decompose(jnp.asarray(X), jnp.asarray(vectors * np.sqrt(np.maximum(values, 0))))
 
 
 def _solution(X: Float64[np.ndarray, "lightings harmonics"], ridge: float) -> Float64[np.ndarray, "harmonics lightings"]:
