@@ -14,6 +14,7 @@ from ddprt.dataset.store import Dataset
 from ddprt.lights import DirectionalLight, Lighting, lighting_json
 from ddprt.methods import METHODS
 from ddprt.methods.method import AsksForLights
+from ddprt.runtime.model import Model
 
 SETTINGS: dict[str, dict[str, Any]] = {"mlp": {"steps": 300, "width": 32}, "sh-prt": {"order": 1, "space": "linear"}}
 
@@ -66,6 +67,11 @@ def fit(data: Dataset, method: str, *, settings: dict[str, Any] | None = None, *
     if not asks(method):
         return ddprt.fit(data, method, settings=settings, **options)
     return Lit(ddprt.fit(under_suns(data), method, settings=settings, **options))
+
+
+def bare(model: Any) -> Model:
+    """The model itself, to be handed to the package."""
+    return model.model if isinstance(model, Lit) else model
 
 
 def load_model(folder: str) -> Any:

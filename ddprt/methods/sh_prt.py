@@ -115,7 +115,7 @@ class ShPrt(Method):
         """
         described = describe(train.frame.lightings or (), self.order)
         light, scale = np.asarray(in_memory(train.indirect)), np.asarray(train.scale, np.float64)
-        root = np.sqrt(entry_weights(train.area, train.weights, "mono").astype(np.float64))
+        root = np.sqrt(entry_weights(train.area, train.weights, "mono").astype(np.float64))  # type: ignore[arg-type]
         size = np.linalg.norm(described, axis=1)
         X, relative = described / _positive(size)[:, None], scale / _positive(size)
         lit = [np.flatnonzero(size[:, channel] > 0) for channel in range(3)]

@@ -116,8 +116,8 @@ def _surface(
     index = np.full(used.shape, -1)
     index[used] = np.arange(used.sum())
     quads = []
-    for around, outward in edges:
-        quad = index[tuple(np.moveaxis(around, -1, 0))]
+    for cells, outward in edges:
+        quad = index[tuple(np.moveaxis(cells, -1, 0))]
         quads.append(np.where(outward[:, None], quad, quad[:, ::-1]))
     corners = np.concatenate(quads)
     return sums[used] / crossings[used][:, None], corners[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
