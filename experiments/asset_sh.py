@@ -24,6 +24,7 @@ from ddprt.dataset.store import Dataset
 from ddprt.report.drawing import INK, blank, saved, style
 from ddprt.report.metrics import Truth
 from ddprt.report.view import LUMINANCE, Camera, exposure_for, take_view, tonemap
+from ddprt.runtime.model import Model
 from ddprt.scene.mesh import Scene
 from ddprt.transport.embree import Tracer
 
@@ -64,14 +65,14 @@ class Asset:
         bright = np.maximum(light, 0) @ LUMINANCE * self.data.area
         return float((bright * self.behind).sum() / bright.sum())
 
-    def fitted(self, kind: str, order: int) -> ddprt.Model:
+    def fitted(self, kind: str, order: int) -> Model:
         if kind == "svd-ridge":
             return ddprt.fit(self.data, bases=(order + 1) ** 2)
         window = "hanning" if kind == "hanning" else "none"
         ridge = "auto" if kind == "sh-prt" else 0.0
         return ddprt.fit(self.data, "sh-prt", ridge=ridge, settings={"order": order, "window": window})
 
-    def light(self, model: ddprt.Model) -> np.ndarray:
+    def light(self, model: Model) -> np.ndarray:
         values = self.data.values(self.test, model.points, model.quantity)
         return model.predict(values, lightings=self.lightings)
 

@@ -16,7 +16,7 @@ _ROUNDING = 0.035  # metres over which parts of a lion one metre long run into e
 _LOW, _HIGH = np.array([-0.36, -0.1, -0.68]), np.array([0.36, 1.06, 0.68])
 
 
-def lion(*, length: float = 1.2, cells: int = 48) -> Scene:
+def lion(*, length: float = 1.2, cells: int = 72) -> Scene:
     """A lion that looks along z. Its flanks shade its legs, its mane shades its shoulders, and it shades the plinth.
 
     Args:
