@@ -124,7 +124,7 @@ def test_the_fit_is_the_projection_where_directions_integrate_exactly() -> None:
 
 @pytest.fixture(scope="module")
 def baked() -> Dataset:
-    """A small lion under even suns and those of a rule (all of it train, so that one set of rays is behind them), and others."""
+    """A small lion under even suns and those of a rule (all train, so that one set of rays is behind them), and others."""
     towards = np.concatenate([spiral(EVEN), product_rule(18)[0]])
     config = load_config(None, {**SMALL, "transport.samples": "64", "transport.test_samples": "64"})
     splits = {"train": suns(towards), "validation": suns(spiral(5)), "test": suns(spiral(9))}
