@@ -21,6 +21,7 @@ from ddprt.verbs import LATER, VERBS, Call
 
 REPORT_ISSUE = "this is our fault: run again with --debug and report what it prints"
 _AGAIN = 0.02  # seconds until a dropped interrupt is asked for again
+WHOLE = ("seed", "sweep")  # settings that stand in no section
 FLAGS = {"quiet": "no progress", "debug": "tracebacks instead of one-line errors"}
 
 
@@ -177,7 +178,7 @@ def parse(name: str, words: list[str]) -> Call:
         if key in {**verb.flags, **FLAGS} and not given:
             call.options[key] = ""
             continue
-        known = key in verb.options or (verb.configured and ("." in key or key == "seed"))
+        known = key in verb.options or (verb.configured and ("." in key or key in WHOLE))
         if known and "." in key:
             from ddprt.config import check_key
 
@@ -188,7 +189,8 @@ def parse(name: str, words: list[str]) -> Call:
                 from ddprt.config import keys
 
                 choices += keys()
-            raise UserError(f"--{key}: unknown option{nearest(key, choices)}; `ddprt {name} --help` lists all")
+            hint = nearest(key, choices) or ";"
+            raise UserError(f"--{key}: unknown option{hint} `ddprt {name} --help` lists all")
         if not given:
             if not queue:
                 raise UserError(f"--{key}: got no value, expected one after it; write --{key} VALUE")
@@ -214,5 +216,6 @@ def _help(name: str) -> None:
         print("\nsettings (in the file as [section] key = value, here as --section.key value):")
         print("  --methods.settings.NAME '{key = value}'  settings of one method")
         print("  --sweep.SECTION.KEY '[value, value]'     what `ddprt bench` tries of a setting")
+        print("  --sweep '{fit.bases = [4, 8]}'           the same of several settings at once")
         print("  --budget.scenario.KEY VALUE              a setting of [lightings] that held-out ones differ in")
         tyro.cli(Config, args=["--help"], prog=usage, add_help=True, config=(tyro.conf.FlagConversionOff,))

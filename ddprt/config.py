@@ -25,6 +25,7 @@ from ddprt.sections import (
     LightingsConfig,
     MethodsConfig,
     PointsConfig,
+    ProbesConfig,
     ReportConfig,
     SceneConfig,
     Section,
@@ -43,6 +44,7 @@ class Config(Section):
     points: PointsConfig = PointsConfig()
     transport: TransportConfig = TransportConfig()
     effects: EffectsConfig = EffectsConfig()
+    probes: ProbesConfig = ProbesConfig()
     fit: FitConfig = FitConfig()
     methods: MethodsConfig = MethodsConfig()
     report: ReportConfig = ReportConfig()

@@ -196,10 +196,12 @@ class Run:
 
     def export(self, model: Any) -> list[Path]:
         """Writes what engines load."""
+        from ddprt.export.probes import export_probes
         from ddprt.export.textures import export_textures
 
         with self.progress.stage("export"):
             files = export_textures(model, self.folder / "export", **self.config.export.model_dump())
+            export_probes(model, self.folder / "export")
         seams = json.loads(files[-1].read_text())["seams"]
         if self.config.export.stitch and not seams["stitched"]:
             self.progress.warn(f"export.stitch: seams stay open: {seams['why']}")
@@ -219,7 +221,7 @@ class Run:
 
     def effects(self, data: Dataset) -> Plan:
         """The plan that the dataset was baked under."""
-        return plan(self.scene, data.lightings, bounces=self.config.transport.bounces)
+        return plan(self.scene, data.lightings, bounces=self.config.transport.bounces, probes=self.config.probes.asked)
 
     def costs(self, data: Dataset) -> list[dict[str, Any]]:
         """The plan's effects with their rays, seconds and share of the light."""
@@ -277,7 +279,8 @@ def _effects(effects: Plan, stages: list[dict[str, Any]], data: Dataset) -> list
     rows = []
     for effect in effects.effects:
         bounces = effect.name == "diffuse bounces"
-        own = [s for s in stages if str(s["name"]).startswith("indirect" if bounces else "direct") and effect.called]
+        of = "indirect" if bounces else "direct" if effect.name.endswith(" lights") else effect.name
+        own = [s for s in stages if str(s["name"]).startswith(of) and effect.called]
         share = indirect if bounces else by_kind.get(effect.name.removesuffix(" lights"), 0.0)
         cost = {"rays": sum(int(s.get("rays", 0)) for s in own), "seconds": round(sum(float(s["seconds"]) for s in own), 4)}
         rows.append({**asdict(effect), **cost, "energy_share": share / total if total > 0 else 0.0})

@@ -56,7 +56,7 @@ def describe(source: str, overrides: dict[str, str]) -> str:
     settings = config.lightings
     lightings, told = _some_lightings(config, scene, tracer)
     lines += told
-    for effect in plan(scene, lightings, bounces=config.transport.bounces).effects:
+    for effect in plan(scene, lightings, bounces=config.transport.bounces, probes=config.probes.asked).effects:
         if not lightings and effect.name.endswith(" lights"):
             continue  # nobody knows
         state = "called for" if effect.called else "left out"

@@ -6,6 +6,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 Range = tuple[float, float]
 Unit = Annotated[float, Field(ge=0.0, le=1.0)]
+Count = Annotated[int, Field(ge=0, le=1024)]
 
 
 class Section(BaseModel):
@@ -55,7 +56,7 @@ class LightingsConfig(Section):
     distribution: Literal["room", "around"] = Field(
         "room", description="room: free space inside the bounding box; around: a shell about the asset"
     )
-    kinds: tuple[Literal["point", "spot", "directional", "rect", "sphere"], ...] = Field(
+    kinds: tuple[Literal["point", "spot", "directional", "rect", "sphere", "environment"], ...] = Field(
         ("point",), min_length=1, description="kinds of light to draw from, each equally likely"
     )
     lights: tuple[int, int] = Field((1, 1), description="fewest and most lights that are on together")
@@ -69,11 +70,14 @@ class LightingsConfig(Section):
     distance: Range = Field((1.5, 3.0), description="around: distance from the asset's centre in bounding radii")
     elevation_deg: Range = Field((0.0, 90.0), description="around: height above the horizon")
     intensity: tuple[Annotated[float, Field(gt=0, le=1e25)], Annotated[float, Field(gt=0, le=1e25)]] = Field(
-        (1.0, 1.0), description="W/sr of a lamp at each end of a log-uniform range"
+        (1.0, 1.0), description="W/sr of a lamp at each end of a log-uniform range; W/m² of a directional light; scale of a sky"
     )
     saturation: Range = Field((0.0, 0.0), description="0 is white, 1 a fully saturated random hue")
     spot_outer_deg: Range = Field((25.0, 50.0), description="half-angle of a spot's cone; the inner cone is 0.6 of it")
     size: float = Field(0.05, gt=0.0, description="area lights: half-edge or radius, as a fraction of the bounding radius")
+    environment: str = Field(
+        "sun-sky", min_length=1, description="image of environment lights: an .exr or .hdr file, or white, gradient or sun-sky"
+    )
 
     @model_validator(mode="after")
     def _ranges_rise(self) -> "LightingsConfig":
@@ -156,6 +160,38 @@ class EffectsConfig(Section):
 
     on: tuple[str, ...] = Field((), description="effects to simulate though the scene does not call for them")
     off: tuple[str, ...] = Field((), description="effects to leave out though the scene calls for them")
+
+
+class ProbesConfig(Section):
+    """Points in free air whose light objects take that move through the scene; none unless a grid or a file names some."""
+
+    grid: tuple[Count, Count, Count] = Field((0, 0, 0), description="probes along x, y and z; 0, 0, 0: none")
+    region_low: tuple[Unit, Unit, Unit] = Field(
+        (0.0, 0.0, 0.0),
+        description="lowest corner of the grid as fractions of the bounding box; each probe in its cell's middle",
+    )
+    region_high: tuple[Unit, Unit, Unit] = Field((1.0, 1.0, 1.0), description="highest corner, likewise")
+    file: str = Field("", description="JSON list of positions [x, y, z] in metres, in place of a grid")
+    rays: Literal["auto"] | Annotated[int, Field(ge=16, le=2**20)] = Field(
+        "auto",
+        description="rays of each probe (of each half, for held-out lightings), rounded up to a power of two; auto: as "
+        "transport.target_noise asks",
+    )
+
+    @model_validator(mode="after")
+    def _one_way(self) -> "ProbesConfig":
+        if any(self.grid) and not all(self.grid):
+            raise ValueError(f"grid: got {list(self.grid)}, expected at least 1 along each axis, or [0, 0, 0]; raise the zeros")
+        if any(self.grid) and self.file:
+            raise ValueError("file: got one together with a grid, expected one of the two; leave one out")
+        if any(low >= high for low, high in zip(self.region_low, self.region_high, strict=True)):
+            raise ValueError("region_low: got no less than region_high, expected a box; lower it or raise that")
+        return self
+
+    @property
+    def asked(self) -> str:
+        """Which probes, in words; empty for none."""
+        return self.file or (" x ".join(map(str, self.grid)) if any(self.grid) else "")
 
 
 class FitConfig(Section):

@@ -208,7 +208,8 @@ def export(call: Call) -> None:
 
 def verify(call: Call) -> None:
     """find damaged or missing files of a dataset"""
-    from ddprt.dataset.store import Manifest, expected_files, read_description
+    from ddprt.dataset.manifest import Manifest
+    from ddprt.dataset.store import expected_files, read_description
 
     folder = Path(call.file("a dataset or a run folder"))
     folder = folder / "dataset" if (folder / "dataset").is_dir() else folder

@@ -30,7 +30,7 @@ from bake_stage import RESOLUTION, Stage, bake, bake_twice, command, stage, trut
 import ddprt
 from ddprt import seeds, warp
 from ddprt.config import load_config
-from ddprt.dataset.store import Manifest
+from ddprt.dataset.manifest import Manifest
 from ddprt.errors import UserError
 from ddprt.lights import Lighting
 from ddprt.progress import Progress

@@ -12,7 +12,7 @@ from oracles import U32, over_bound, rounding
 
 import ddprt
 from ddprt.dataset import store
-from ddprt.dataset.store import map_name
+from ddprt.dataset.manifest import Manifest, map_name
 from ddprt.errors import UserError
 from ddprt.files import read_tensors, write_tensors
 from ddprt.scene.exr import read_exr, write_exr
@@ -31,12 +31,12 @@ def _imported(kind: str, value: float, *, split: str = "train") -> Callable[[], 
             if kind == "measured":
                 light = data.measured_light[index].copy()
                 light[3, 1] = value
-                path = folder / store.map_name(kind, index)
+                path = folder / map_name(kind, index)
                 write_tensors(path, {"irradiance": light})
             else:
                 image = data.indirect_light[index][None].copy() if kind != "area" else np.ones((1, TEXELS, 1), np.float32)
                 image[0, 3, -1] = value
-                path = folder / (f"atlas/{kind}.exr" if kind == "area" else store.map_name(kind, index))
+                path = folder / (f"atlas/{kind}.exr" if kind == "area" else map_name(kind, index))
                 raw_exr(path, image)
             try:
                 model = ddprt.fit(ddprt.open_dataset(folder), bases=BASES, ridge=1e-3)
@@ -74,7 +74,7 @@ def raw_exr(path: Path, image: np.ndarray, attributes: dict[str, str] | None = N
 def on_disk(data: Arrays, folder: Path) -> None:
     """Writes a made-up dataset as a bake would."""
     store.write_description(folder, data.description)
-    manifest, samples = store.Manifest(folder), data.samples
+    manifest, samples = Manifest(folder), data.samples
     tensors = {"position": samples.position, "normal": samples.normal, "albedo": samples.albedo}
     write_tensors(folder / "points.safetensors", {**tensors, "spacing": np.array([samples.spacing])})
     write_tensors(folder / "scene.safetensors", {"corners": data.occluders})
@@ -83,9 +83,9 @@ def on_disk(data: Arrays, folder: Path) -> None:
         values = data.area[:, None] if name.endswith("area.exr") else np.full((len(data.area), channels), 0.5)
         write_exr(folder / name, values[None].astype(np.float32))
     for index in range(len(data.measured_light)):
-        write_tensors(folder / store.map_name("measured", index), {"irradiance": data.measured_light[index]})
+        write_tensors(folder / map_name("measured", index), {"irradiance": data.measured_light[index]})
         for kind in ("direct", "indirect", "noise"):
-            write_exr(folder / store.map_name(kind, index), data.indirect_light[index][None])
+            write_exr(folder / map_name(kind, index), data.indirect_light[index][None])
     for name in store.expected_files(data.description):
         manifest.add(name)
 

@@ -137,6 +137,13 @@ def test_rows_go_from_exact_to_coarse_and_name_their_fronts(found: Sweep) -> Non
     assert [row["record"]["name"] for row in rows if row["base"]] == [BASE]
 
 
+def test_a_front_is_told_as_what_no_setting_beats(page: str, found: Sweep) -> None:
+    """Not as what none errs less than: that is the most exact setting alone, and fronts have others."""
+    assert any(row["on"] for row in found.rows()[1:])
+    assert "no other one beats it there" in page
+    assert not re.search("no other (setting|one) errs less", page)
+
+
 def test_data_holds_every_pair_and_lies_within_its_axes(page: str, found: Sweep) -> None:
     data = data_of(page)
     assert [axis["key"] for axis in data["errors"]] == list(ERRORS)

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ddprt.cli import LATER, VERBS, main
-from ddprt.config import load_config
+from ddprt.cli import LATER, VERBS, WHOLE, main, parse
+from ddprt.config import keys, load_config
 from ddprt.scene.exr import read_exr
 
 SMALL = """
@@ -92,7 +92,7 @@ def test_run_leaves_what_is_promised(done: Path, job: Path) -> None:
     assert bounces["rays"] > 0
     assert 0 < bounces["energy_share"] < 1
     assert sum(effect["energy_share"] for effect in run["effects"]) == pytest.approx(1)
-    assert [effect["rays"] for effect in run["effects"] if not effect["called"]] == [0] * 4
+    assert not any(effect["rays"] for effect in run["effects"] if not effect["called"])
 
 
 def test_resolved_configuration_runs_again_without_baking(done: Path, capfd: pytest.CaptureFixture) -> None:
@@ -148,7 +148,13 @@ FAULTS = {
     "empty folder after =": (["fit", "{job}", "--out="], "--out: got an empty value, expected DIR"),
     "unknown setting of bake": (["bake", "{job}", "--fit.basis", "3"], "`ddprt bake --help` lists all"),
     "missing file": (["run", "nothing.toml"], "expected a readable TOML file"),
-    "unknown option": (["run", "{job}", "--otu", "x"], '--otu: unknown option; did you mean "out"?'),
+    "unknown option": (
+        ["run", "{job}", "--otu", "x"],
+        'did you mean "out"? `ddprt run --help` lists all',
+    ),
+    "option like no other": (["run", "{job}", "--zzzz", "x"], "--zzzz: unknown option; `ddprt run --help` lists all"),
+    "a sweep that is no table": (["bench", "{job}", "--sweep", "[4]"], "--sweep: got [4], expected dictionary"),
+    "a knob without a list": (["bench", "{job}", "--sweep", "{{fit.bases = 4}}"], "--sweep: got 4, expected a list"),
     "option without value": (["run", "{job}", "--fit.bases"], "--fit.bases: got no value"),
     "unknown setting": (["run", "{job}", "--fit.basis", "3"], 'did you mean "fit.bases"?'),
     "wrong type": (["run", "{job}", "--fit.bases=x"], "--fit.bases: got 'x', expected integer"),
@@ -502,3 +508,13 @@ def test_an_interrupt_that_a_callback_drops_comes_again(monkeypatch: pytest.Monk
     assert time.perf_counter() - begun < 4, "the wait was woken"
     assert "goes on from there" in capsys.readouterr().err
     assert ignored == [ValueError]
+
+
+def test_settings_in_no_section_are_options_of_their_own() -> None:
+    """As they are named where an option is unknown."""
+    assert {*WHOLE} == {key for key in keys() if "." not in key}
+    call = parse("bench", ["job.toml", "--sweep", "{fit.bases = [4, 8], fit.space = ['gamma']}", "--seed=3"])
+    assert call.files == ["job.toml"]
+    config = load_config(None, call.overrides)
+    assert config.sweep == {"fit.bases": (4, 8), "fit.space": ("gamma",)}
+    assert config.seed == 3

@@ -83,7 +83,7 @@ FAULTS = {
     "an entry is told, its list is not": (
         '[lightings]\nkinds = ["pont"]\n',
         {},
-        ["'rect' or 'sphere'; did you mean \"point\"?"],
+        ["'sphere' or 'environment'; did you mean \"point\"?"],
     ),
     "truth for a number": ("", {"atlas.resolution": "true"}, ["--atlas.resolution: got 'true', expected integer"]),
     "truth for auto or a number": ("[transport]\nsamples = true\n", {}, ["transport.samples: got 'true'", "'auto' or integer"]),

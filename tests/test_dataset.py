@@ -19,9 +19,10 @@ from ddprt.config import Config
 from ddprt.dataset import generate
 from ddprt.dataset.generate import bake, differences
 from ddprt.dataset.indirect import IndirectBake
+from ddprt.dataset.manifest import Manifest
 from ddprt.dataset.scratch import Scratch
 from ddprt.dataset.splits import split_lightings
-from ddprt.dataset.store import Manifest, average_into_points, expected_files, open_dataset, read_map, write_map
+from ddprt.dataset.store import average_into_points, expected_files, open_dataset, read_map, write_map
 from ddprt.errors import UserError
 from ddprt.files import alone_in
 from ddprt.progress import Progress

@@ -127,6 +127,11 @@ def test_nothing_is_measured_twice(again: Path, measured: list[str]) -> None:
     assert sorted(measured) == FAILING, "only what failed is tried again"
 
 
+def test_a_sweep_of_more_repeats_is_measured_anew(again: Path, measured: list[str]) -> None:
+    quiet(base(sweep={"fit.bases": (2,)}, bench__repeats=2), again)
+    assert measured == ["as configured", "fit.bases = 2"]
+
+
 def test_other_sweeps_find_theirs(again: Path, measured: list[str]) -> None:
     quiet(base(sweep={"fit.bases": (2,)}), again)
     assert measured == []
@@ -138,7 +143,7 @@ def edited(path: Path, name: str, change: Callable[[dict[str, Any]], Any]) -> No
     records = [json.loads(line) for line in path.read_text().splitlines()]
     for record in records:
         if record["name"] == name:
-            change(record)
+            change(record)  # which may take its name
     path.write_text("".join(json.dumps(record) + "\n" for record in records))
 
 
@@ -151,8 +156,27 @@ def edited(path: Path, name: str, change: Callable[[dict[str, Any]], Any]) -> No
         lambda record: record.update(sources="others"),
         lambda record: record.update(schema=0),
         lambda record: record.pop("failed"),
+        lambda record: record.pop("environment"),
+        lambda record: record["environment"].pop("when"),
+        lambda record: record["environment"].update(machine="this one"),
+        lambda record: record["environment"]["machine"].update(packages=["numpy"]),
+        lambda record: record.update(scores="nine"),
+        lambda record: record["scores"].update(relative_rmse="nine"),
+        lambda record: record["scores"].pop("relative_rmse"),
+        lambda record: record.update(bake=[1.0]),
+        lambda record: record.pop("bytes"),
+        lambda record: record.pop("config"),
+        lambda record: record.update(changes="fit.bases"),
+        lambda record: record.update(remarks="none"),
+        lambda record: record.update(remarks=[{}, {}]),
+        lambda record: record.pop("name"),
+        lambda record: record.update(repeats="many"),
     ],
-    ids=["machine", "version", "truth", "files", "schema", "no outcome"],
+    ids=[
+        *("machine", "version", "truth", "files", "schema", "no outcome", "no surroundings", "no date", "no machine"),
+        *("no packages", "no scores", "score in words", "no score", "no bake", "no bytes", "no configuration", "no changes"),
+        *("no remarks", "no words", "no name", "repeats in words"),
+    ],
 )
 def test_what_does_not_compare_is_measured_anew(again: Path, measured: list[str], change: Any) -> None:
     edited(again / RESULTS, "fit.bases = 2", change)
@@ -180,16 +204,30 @@ def test_a_line_that_was_cut_is_measured_anew(again: Path, measured: list[str], 
     assert len(read_results(path)) == len(whole) + 1
 
 
-@pytest.mark.parametrize("text", ["null", "[]", '"digest"', "{}", '{"digest": []}', '{"digest": "x"', "\x00"])
-def test_lines_that_are_no_records_are_passed_over(tmp_path: Path, text: str) -> None:
-    path = tmp_path / RESULTS
-    path.write_text(f'{{"digest": "a"}}\n{text}\n{{"digest": "b"}}\n')
-    assert list(read_results(path)) == ["a", "b"]
+@pytest.mark.parametrize("text", ["null", "[]", '"digest"', "{}", '{"digest": []}', '{"digest": "x"', "\x00", "[" * 10**5])
+def test_lines_that_are_no_records_are_passed_over_and_counted(
+    again: Path, text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = again / RESULTS
+    first, *more, last = path.read_text().splitlines()
+    path.write_text("\n".join([first, *more, last]) + "\n")
+    whole = read_results(path, Progress())
+    assert capsys.readouterr().err == "", "nothing is said where nothing is left out"
+    path.write_text("\n".join([first, text, *more, last]) + "\n")
+    assert read_results(path, Progress()) == whole
+    assert capsys.readouterr().err == f"{RESULTS}: {len(whole)} of {len(whole) + 1} lines are whole; the others do not count\n"
+
+
+def test_a_sweep_says_how_many_lines_do_not_count(again: Path, measured: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    edited(again / RESULTS, "fit.bases = 2", lambda record: record.pop("environment"))
+    sweep(base(sweep={"fit.bases": (2,)}), again, Progress())
+    assert "lines are whole; the others do not count" in capsys.readouterr().err
+    assert measured == ["fit.bases = 2"]
 
 
 def test_results_that_cannot_be_read_are_told_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / RESULTS).write_bytes(b"\xff\xfe\n")
-    with pytest.raises(UserError, match=r"results.jsonl: cannot be read"):
+    with pytest.raises(UserError, match=r"results.jsonl: cannot be read .*; save it as UTF-8, or delete it"):
         quiet(base(), tmp_path)
     assert (tmp_path / RESULTS).read_bytes() == b"\xff\xfe\n"
 

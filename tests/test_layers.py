@@ -11,7 +11,8 @@ from ddprt import warp
 from ddprt.config import checked
 from ddprt.dataset import store
 from ddprt.dataset.layers import Layer, LayerData, layers, read_layer, read_light, write_light, write_places
-from ddprt.dataset.store import Dataset, Manifest
+from ddprt.dataset.manifest import Manifest
+from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.harmonics import harmonics
 

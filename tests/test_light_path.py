@@ -13,7 +13,7 @@ from ddprt.scene.mesh import Scene
 from ddprt.transport.embree import Tracer
 
 EPS = float(np.finfo(np.float64).eps)
-PLACED = [kind for kind in LIGHTS if kind != "directional"]
+PLACED = [kind for kind in LIGHTS if kind not in ("directional", "environment")]
 
 
 def drawn(scene: Scene, tracer: Tracer, kinds: list[str], count: int = 3, lights: int = 1) -> tuple[Lighting, ...]:
@@ -78,10 +78,16 @@ def test_distant_lights_turn_evenly(tracer: Tracer) -> None:
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=4 * EPS)
 
 
+def test_skies_turn_evenly(tracer: Tracer) -> None:
+    lighting = parse_lighting({"type": "environment", "image": "white", "rotation_deg": 350.0})
+    turns = [frame[0].rotation_deg for frame in light_path(lighting, tracer.clearance, 5)]  # type: ignore[attr-defined]
+    np.testing.assert_allclose(turns, 350 + TURN_DEG * np.array([-1, -0.5, 0, 0.5, 1]), atol=512 * EPS)
+
+
 @pytest.mark.parametrize("kind", list(LIGHTS))
 def test_nothing_else_changes(cornell: Scene, tracer: Tracer, kind: str) -> None:
     (lighting,) = drawn(cornell, tracer, [kind], 1)
-    moving = {"direction"} if kind == "directional" else {"position", "center"}
+    moving = {"directional": {"direction"}, "environment": {"rotation_deg"}}.get(kind, {"position", "center"})
     kept = {key: value for key, value in lighting_json(lighting)[0].items() if key not in moving}
     for frame in light_path(lighting, tracer.clearance, 4):
         assert kept == {key: value for key, value in lighting_json(frame)[0].items() if key not in moving}

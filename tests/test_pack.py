@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 from ddprt.dataset import pack as packing
+from ddprt.dataset.manifest import Manifest, map_name
 from ddprt.dataset.pack import Pack, open_pack
-from ddprt.dataset.store import Dataset, Manifest, discard, map_name, open_dataset, write_description, write_map
+from ddprt.dataset.store import Dataset, discard, open_dataset, write_description, write_map
 from ddprt.errors import UserError
 from ddprt.progress import Doubt
 from ddprt.scene.exr import write_exr

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ddprt.bench.tune.planner import KNOBS, Law, Place, Plan, Planner, Trial
+from ddprt.bench.tune.planner import KNOBS, QUANTITIES, Law, Place, Plan, Planner, Trial
 
 BASE: Place = (256.0, 128.0, 0.01, 128.0)
 VALUES = ((64.0, 128.0, 181.0, 256.0), (16.0, 32.0, 64.0, 128.0, 256.0), (0.005, 0.01, 0.02, 0.04), (64.0, 128.0, 256.0))
@@ -143,6 +143,49 @@ def test_where_all_else_is_barred_the_place_that_was_tried_is_the_answer() -> No
     still = Planner(BASE, [(value,) for value in BASE], BASES, ("half", "float"), planner.limits)
     still.add(world(BASE))
     assert still.next() == (plan, chance), "no knob can be turned"
+
+
+@pytest.mark.parametrize("far", [1e-2, 1e-6, 1e-300])
+@pytest.mark.parametrize("name", QUANTITIES)
+def test_the_nearest_is_the_nearest_however_far_it_is(name: str, far: float) -> None:
+    """A chance of nothing does not tell plans apart, nor may one be near for being little known."""
+    tried = (BASE, (128.0, 64.0, 0.02, 128.0))
+    plans = [Plan(*parts) for parts in product(tried, LADDER, ("half", "float"))]
+    least = min(measured(world(plan.place), plan)[name] for plan in plans)
+    planner = Planner(BASE, VALUES, BASES, ("half", "float"), {name: far * least})
+    for place in tried:
+        planner.add(world(place))
+    planner.barred = {*product(*VALUES)} - {*tried}
+    plan, chance = planner.next()
+    assert measured(world(plan.place), plan)[name] == pytest.approx(least, rel=1e-12)
+    assert planner.hopeless(chance)
+    others = [Plan(*parts) for parts in product(tried, BASES, ("half", "float"))]
+    assert planner.rank(plan) == max(map(planner.rank, others))
+    if name == "relative_rmse":
+        assert plan == Plan(BASE, 128, "half")
+    else:
+        errors = {each: measured(world(each.place), each) for each in plans}
+        alike = [told["relative_rmse"] for told in errors.values() if told[name] <= least * (1 + 1e-12)]
+        # Of what costs as little, the most exact; beyond the ladder's end fewer bases are told as its end is.
+        assert measured(world(plan.place), plan)["relative_rmse"] == pytest.approx(min(alike), rel=1e-12)
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+@pytest.mark.parametrize(("frame", "bake"), [(1e-3, 1e-9), (1e-9, 1e-3), (1e-200, 1e-300)])
+def test_of_limits_far_out_of_reach_the_farthest_binds(frame: float, bake: float, swapped: bool) -> None:
+    """Whatever the order in which they were given."""
+    order = ("bake_seconds", "frame_us") if swapped else ("frame_us", "bake_seconds")
+    limits = {"frame_us": frame, "bake_seconds": bake}
+    planner = Planner(BASE, [(value,) for value in BASE], BASES, ("half",), {name: limits[name] for name in order})
+    planner.add(world(BASE))  # 20 microseconds and 14 seconds at least
+    assert planner.binding() == ("bake_seconds" if bake < frame else "frame_us")
+
+
+def test_trials_are_learned_from_not_handed_over() -> None:
+    """A planner that was made of some would know no laws."""
+    for given in ({"trials": [world(BASE)]}, {"barred": {BASE}}, {"_laws": {}}):
+        with pytest.raises(TypeError, match="unexpected keyword"):
+            Planner(BASE, VALUES, BASES, ("half",), {"frame_us": 1.0}, **given)
 
 
 def test_knobs_and_places_are_of_one_length() -> None:

@@ -22,7 +22,9 @@ FREE = {
     "corridor": [(1, 1, 1), (5, 2, 2), (3, 1, 1.5)],
     "statue": [(2, 1, 0), (-1, 0.1, 2), (0, 3, 0)],
     "convex": [(0.6, 0, 0), (0.7, 0.8, 0.9), (0, -3, 0.1)],
+    "neon": [(0.0, 1.0, 2.5), (-0.3, 1.5, 0.3), (1.2, 0.2, 1.0)],
     "faults": [(0.2, 0.5, 0.9), (1.7, 0.8, 0.2)],
+    "leaves": [(1.0, 1.8, 1.0), (0.2, 0.1, 0.2), (1.9, 1.2, 1.1)],
 }
 
 
@@ -66,7 +68,8 @@ def front_hits(scene: Scene, origin: np.ndarray, directions: np.ndarray) -> np.n
             v, t = (q @ direction) * scale, ((c - a) * q).sum(1) * scale
             t = np.where((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 1e-9), t, np.inf)
         if np.isfinite(t.min()):
-            found.append(scene.geometric_normals[t.argmin()] @ direction < 0)
+            nearest = t <= t.min() + 1e-9  # both sides of a sheet
+            found.append(bool((scene.geometric_normals[nearest] @ direction < 0).any()))
     return np.array(found)
 
 
@@ -82,7 +85,7 @@ def test_fronts_face_the_free_space(scenes: dict[str, Scene], name: str) -> None
 @pytest.mark.parametrize("name", list(SCENES))
 def test_library_scenes_need_no_repair(scenes: dict[str, Scene], name: str) -> None:
     scene = scenes[name]
-    assert scene.notes == ()
+    assert scene.notes == (("10 triangles of two-sided materials have a back of their own",) if name == "leaves" else ())
     np.testing.assert_allclose(np.linalg.norm(scene.normals, axis=1), 1, atol=1e-12)
     assert (np.einsum("tcd,td->tc", scene.normals[scene.triangles], scene.geometric_normals) > 0.5).all()
     assert scene.digest == build(name, **SMALL.get(name, {})).digest

@@ -230,13 +230,14 @@ def test_what_is_ignored_is_listed_once(tmp_path: Path) -> None:
     writer = one(material=0)
     writer.mesh(mode=1)
     writer.node(mesh=1)
-    writer.json["materials"] = [
-        {"emissiveFactor": [1, 0, 0], "alphaMode": "BLEND", "doubleSided": True, "pbrMetallicRoughness": {}}
-    ]
+    writer.json["materials"] = [{"emissiveFactor": [1, 0, 0], "alphaMode": "MASK", "pbrMetallicRoughness": {}}] * 2
+    writer.json["materials"][1] = {"normalTexture": {"index": 0}, "occlusionTexture": {"index": 0}}
+    writer.mesh(material=1, positions=TRIANGLE + FACING)
+    writer.node(mesh=2)
     writer.json["extensionsUsed"] = ["KHR_lights_punctual"]
     scene = load_scene(writer.glb(tmp_path / "much.glb"))
     (note,) = scene.notes
-    for word in ("KHR_lights_punctual", "alpha", "double-sided", "emissive", "metallic", "points and lines"):
+    for word in ("KHR_lights_punctual", "normal maps", "occlusion maps", "points and lines"):
         assert note.count(word) == 1
 
 
@@ -572,3 +573,128 @@ def test_pictures_become_linear() -> None:
     np.testing.assert_allclose(linear[1], [[0] * 3, [0.502886] * 3, [1] * 3], atol=1e-5)
     deep = linear_image(Image.fromarray(np.array([[0, 32768, 65535]], np.uint16)))
     np.testing.assert_allclose(deep[0, :, 0], [0, 0.21404, 1], atol=1e-4)
+
+
+def rgba_png(pixels: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(pixels.astype(np.uint8)).save(stream, "PNG")
+    return stream.getvalue()
+
+
+def painted(material: dict, *pictures: bytes, coordinates: int = 1) -> Writer:
+    """A triangle of one material, whose textures 0, 1, ... are these pictures."""
+    writer = Writer()
+    places = [np.array([[0.0, 1], [1, 0], [0.5, 0]]), np.array([[0.25, 0.5], [1, 0], [0.5, 0]])]
+    attributes = {f"TEXCOORD_{k}": writer.accessor(places[k]) for k in range(coordinates)}
+    writer.node(mesh=writer.mesh(material=0, attributes=attributes))
+    writer.json["materials"] = [{"name": "paint", **material}]
+    writer.json["images"] = [{"bufferView": writer.view(picture), "mimeType": "image/png"} for picture in pictures]
+    writer.json["textures"] = [{"source": k} for k in range(len(pictures))]
+    return writer
+
+
+ALPHA = np.array([[[255, 0, 0, 0], [0, 255, 0, 100]], [[0, 0, 255, 200], [9, 9, 9, 255]]])
+
+
+def test_masks_become_cutouts(tmp_path: Path) -> None:
+    base = {"baseColorTexture": {"index": 0}, "baseColorFactor": [1, 1, 1, 0.5]}
+    mask = {"alphaMode": "MASK", "alphaCutoff": 0.25, "doubleSided": True, "pbrMetallicRoughness": base}
+    scene = load_scene(painted(mask, rgba_png(ALPHA)).glb(tmp_path / "mask.glb"))
+    (material,) = scene.materials
+    assert material.cutout is not None
+    assert material.cutout.cutoff == 0.25
+    np.testing.assert_allclose(material.cutout.opacity, ALPHA[..., 3] / 255 / 2, rtol=1e-6)
+    np.testing.assert_allclose(material.texture, srgb_to_linear(ALPHA[..., :3] / 255), rtol=1e-6)
+    assert material.two_sided
+    assert len(scene.triangles) == 2
+    assert not any("alpha" in note or "double" in note or "ignored" in note for note in scene.notes)
+
+    by_default = {**mask, "alphaCutoff": None, "doubleSided": False}
+    (material,) = load_scene(
+        painted({k: v for k, v in by_default.items() if v}, rgba_png(ALPHA)).glb(tmp_path / "a.glb")
+    ).materials
+    assert material.cutout is not None
+    assert material.cutout.cutoff == 0.5
+    assert not material.two_sided
+
+
+def test_masks_that_nothing_passes_are_none(tmp_path: Path) -> None:
+    whole = {"alphaMode": "MASK", "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0.5]}}
+    assert load_scene(painted(whole).glb(tmp_path / "whole.glb")).materials[0].cutout is None
+    opaque = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
+    assert load_scene(painted(opaque, rgba_png(ALPHA)).glb(tmp_path / "opaque.glb")).materials[0].cutout is None
+    for cutoff in (0.6, 3.0):  # the standard lets it exceed 1
+        gone = load_scene(painted({**whole, "alphaCutoff": cutoff}).glb(tmp_path / "gone.glb")).materials[0].cutout
+        assert gone is not None
+        assert (gone.opacity < gone.cutoff).all()
+
+
+def test_blending_is_a_mask_and_named(tmp_path: Path) -> None:
+    blend = {"alphaMode": "BLEND", "alphaCutoff": 0.1, "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
+    scene = load_scene(painted(blend, rgba_png(ALPHA)).glb(tmp_path / "blend.glb"))
+    assert scene.materials[0].cutout is not None
+    assert scene.materials[0].cutout.cutoff == 0.5
+    assert any(note.startswith('material "paint": blending') for note in scene.notes)
+
+
+def test_emission_and_gloss_are_read(tmp_path: Path) -> None:
+    mixed = np.array([[[10, 51, 102], [20, 255, 0]]])
+    material = {
+        "emissiveFactor": [1, 0.5, 0.25],
+        "emissiveTexture": {"index": 0},
+        "extensions": {"KHR_materials_emissive_strength": {"emissiveStrength": 8}},
+        "pbrMetallicRoughness": {
+            "metallicFactor": 0.5,
+            "roughnessFactor": 0.8,
+            "baseColorTexture": {"index": 0},
+            "metallicRoughnessTexture": {"index": 1},
+        },
+    }
+    writer = painted(material, png(), rgba_png(mixed))
+    writer.json["extensionsUsed"] = ["KHR_materials_emissive_strength"]
+    scene = load_scene(writer.glb(tmp_path / "lamp.glb"))
+    emission, gloss = scene.materials[0].emission, scene.materials[0].gloss
+    assert emission is not None
+    assert gloss is not None
+    assert emission.radiance == (8, 4, 2)
+    np.testing.assert_allclose(emission.texture, srgb_to_linear(PICTURE / 255), atol=1e-7)
+    assert (gloss.roughness, gloss.metallic, gloss.dielectric) == (0.8, 0.5, 0.04)
+    np.testing.assert_allclose(gloss.texture, mixed[..., 1:] / 255, rtol=1e-6)
+    assert scene.uv is not None
+    assert scene.notes == ()
+
+
+def test_what_a_material_leaves_out_is_as_the_standard_says(tmp_path: Path) -> None:
+    scene = load_scene(painted({}).glb(tmp_path / "plain.glb"))
+    gloss = scene.materials[0].gloss
+    assert gloss is not None
+    assert (gloss.roughness, gloss.metallic, gloss.texture) == (1.0, 1.0, None)
+    assert scene.materials[0].emission is None
+    assert scene.materials[0].cutout is None
+    assert scene.uv is None
+    dark = painted({"emissiveTexture": {"index": 0}}, png())  # the factor's default is black
+    assert load_scene(dark.glb(tmp_path / "dark.glb")).materials[0].emission is None
+
+
+def test_textures_with_coordinates_of_their_own_count_by_their_mean(tmp_path: Path) -> None:
+    material = {
+        "emissiveFactor": [2, 2, 2],
+        "emissiveTexture": {"index": 0, "texCoord": 1},
+        "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": {"index": 0, "texCoord": 1}},
+    }
+    scene = load_scene(painted(material, png(), coordinates=2).glb(tmp_path / "two.glb"))
+    emission, gloss = scene.materials[0].emission, scene.materials[0].gloss
+    assert emission is not None
+    assert gloss is not None
+    np.testing.assert_allclose(emission.radiance, 2 * srgb_to_linear(PICTURE / 255).mean((0, 1)), rtol=1e-6)
+    np.testing.assert_allclose([gloss.roughness, gloss.metallic], PICTURE[..., 1:].mean((0, 1)) / 255, rtol=1e-6)
+    assert emission.texture is gloss.texture is None
+    for what in ("emission", "metallic and roughness"):
+        assert any(note.startswith(f'material "paint": {what} texture') for note in scene.notes)
+    # Without a base texture the coordinates are those of the first there is.
+    del material["pbrMetallicRoughness"]
+    scene = load_scene(painted(material, png(), coordinates=2).glb(tmp_path / "one.glb"))
+    assert scene.materials[0].emission is not None
+    assert scene.materials[0].emission.texture is not None
+    assert scene.uv is not None
+    np.testing.assert_allclose(scene.uv[0], [0.25, 0.5])

@@ -7,6 +7,10 @@ import pytest
 from ddprt.bench.measure.settings import Setting, changed, plan_of, settings_of
 from ddprt.config import Config, checked, load_config
 from ddprt.errors import UserError
+from ddprt.scene.atlas import build_atlas
+from ddprt.scene.files import load_scene
+from ddprt.transport.embree import Tracer
+from ddprt.transport.operator import Operator
 
 
 def config(**sweep: Any) -> Config:
@@ -49,6 +53,8 @@ def test_settings_that_share_a_dataset_stand_together() -> None:
         ("transport.target_noise", 0.5, False),
         ("atlas.resolution", 64, False),
         ("scene.name", "corridor", False),
+        ("effects.on", ["gloss"], False),
+        ("effects.off", ["gloss"], False),
     ],
 )
 def test_only_what_training_maps_depend_on_asks_for_another_bake(key: str, value: Any, same: bool) -> None:
@@ -123,6 +129,24 @@ def test_knobs_that_a_file_or_another_setting_overrules_are_not_in_the_plan() ->
     assert plan["transport.samples"] == (1, 6)
     assert "transport.sender_resolution" not in plan
     assert "transport.samples" not in plan_of(Config())
+
+
+@pytest.mark.parametrize("resolution", [40, 96, 100, 200, 256])
+@pytest.mark.parametrize("asked", [0, 64, 96])
+def test_senders_of_the_plan_are_all_others(resolution: int, asked: int) -> None:
+    """A bake that cannot differ tells how noisy the clock is, and looks like a choice."""
+    config = changed(Config(), {"atlas.resolution": resolution, "transport.sender_resolution": asked})
+    scene = load_scene("furnace", subdivisions=1)
+    tracer, atlas = Tracer.of(scene), build_atlas(scene, resolution)
+
+    def block(side: int) -> int:
+        return Operator.of(tracer, atlas, side).senders.block
+
+    sides = plan_of(config).get("transport.sender_resolution", ())
+    blocks = [block(side) for side in (asked, *sides)]
+    assert len(set(blocks)) == len(blocks), "each is another"
+    assert {block(side) for side in (32, 64, 128)} <= {*blocks}, "and none is missing"
+    assert list(sides) == sorted(sides), "from coarse to fine"
 
 
 def test_the_plan_stays_within_what_settings_take() -> None:

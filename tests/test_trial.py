@@ -34,7 +34,8 @@ SMALL: dict[str, Any] = {
 }
 BASE = checked(SMALL)
 KEYS = {
-    *("schema", "digest", "digest_bake", "name", "changes", "config", "failed", "truth", "sources", "scores", "floors", "bake"),
+    *("schema", "digest", "digest_bake", "name", "changes", "config", "failed", "truth", "sources", "repeats"),
+    *("scores", "floors", "bake"),
     *("fit", "frame", "batch", "coefficients", "bytes", "flops", "bases", "method", "status", "remarks", "environment"),
 }
 TIMES = {"median", "low", "high", "compile", "repeats"}
@@ -207,6 +208,30 @@ def test_a_bake_of_another_version_machine_or_file_is_made_anew(
         fresh.bake(about())
 
 
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda whole: whole[: len(whole) // 2],
+        lambda whole: "",
+        lambda whole: "[]",
+        lambda whole: "{}",
+        lambda whole: whole.replace('"seconds"', '"hours"', 1),
+        lambda whole: whole.replace('"environment"', '"surroundings"'),
+        lambda whole: whole.replace('"sources"', '"files"'),
+        lambda whole: whole.replace('"bake": {', '"bake": 1, "bait": {'),
+        lambda whole: whole.replace('"machine": {', '"machine": "this one", "engine": {'),
+    ],
+)
+def test_a_bake_whose_note_was_spoilt_is_made_anew(fresh: Workshop, spoil: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    (told,) = fresh.folder.glob("datasets/*/baked.json")
+    whole = told.read_text()
+    assert spoil(whole) != whole
+    told.write_text(spoil(whole))
+    monkeypatch.setattr(trial, "bake", forbidden)
+    with pytest.raises(AssertionError, match="baked again"):
+        fresh.bake(about())
+
+
 def test_a_bake_that_was_cut_off_begins_anew(fresh: Workshop, monkeypatch: pytest.MonkeyPatch) -> None:
     (told,) = fresh.folder.glob("datasets/*/baked.json")
     told.unlink()
@@ -303,10 +328,19 @@ def test_records_hold_until_something_differs(shop: Workshop, record: dict[str, 
         {"truth": "another"},
         {"sources": "others"},
         {"environment": {**record["environment"], "ddprt": "0"}},
+        {"repeats": 0},
     ):
         assert not shop.holds({**record, **other}, about()), other
     assert not shop.holds({}, about())
     assert not measured_here({**record["environment"], "machine": {}})
+
+
+def test_more_repeats_than_were_asked_for_are_measured_anew(shop: Workshop, record: dict[str, Any]) -> None:
+    """What counts is what was asked: where a fit takes long fewer are made, and no other run would make more."""
+    again = replace(shop, config=changed(BASE, {"bench.repeats": 5}))
+    assert not again.holds(record, about())
+    assert again.holds({**record, "repeats": 5, "fit": {**record["fit"], "repeats": 2}}, about())
+    assert shop.holds({**record, "repeats": 5}, about()), "fewer are asked for"
 
 
 def test_forgetting_removes_what_it_says(shop: Workshop, record: dict[str, Any], tmp_path: Path) -> None:

@@ -232,6 +232,61 @@ def test_of_plans_that_are_as_far_off_the_nearest_errs_least(tmp_path: Path, mon
     assert outcome.plan.bases >= 16, "the bake costs the same, however many bases are kept"
 
 
+def test_the_nearest_to_a_limit_of_frames_far_out_of_reach_keeps_few_bases(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    search = searching(tmp_path, tune__max_frame_us=1e-3, tune__trials=3)
+    Bench(monkeypatch)
+    outcome = search.run()
+    assert not outcome.met
+    assert outcome.plan.bases <= 4, "16 take twice as long"
+
+
+def test_the_nearest_to_a_limit_of_bakes_far_out_of_reach_is_the_cheapest_that_was_tried(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    search = searching(tmp_path, tune__max_bake_seconds=1e-4, tune__trials=3)
+    bench = Bench(monkeypatch)
+    monkeypatch.setattr(Search, "_start", lambda search: search.base)
+    outcome = search.run()
+    assert len(bench.asked) > 1
+    assert outcome.plan.place[0] == min(place[0] for place in bench.asked) < search.base[0]
+    assert outcome.plan.bases >= 16, "the bake costs the same, however many bases are kept"
+
+
+def proposing(search: Search, monkeypatch: pytest.MonkeyPatch, *plans: Plan) -> None:
+    """Has the planner propose these, the last one from then on."""
+    left = list(plans)
+    monkeypatch.setattr(search.planner, "next", lambda: (left.pop(0) if len(left) > 1 else left[0], 0.5))
+
+
+def test_a_nearer_plan_that_was_tried_last_is_the_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where an earlier one was verified, and no trial is left for what looks better still."""
+    search = searching(tmp_path, tune__max_relative_rmse=0.1, tune__trials=2)
+    Bench(monkeypatch)
+    better, best = ((*search.base[:1], factor * search.base[1], *search.base[2:]) for factor in (2, 4))
+    proposing(search, monkeypatch, *(Plan(place, 16, "half") for place in (search.base, better, best)))
+    outcome = search.run()
+    assert outcome.trials == 2
+    assert outcome.plan.place == better
+
+
+def test_what_was_measured_within_the_limits_is_better_than_what_was_likelier(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    search = searching(tmp_path, tune__max_relative_rmse=0.6, tune__max_frame_us=15.0)
+    Bench(monkeypatch)
+    within, beyond = Plan(search.base, 8, "half"), Plan(search.base, 12, "half")
+    reached = {within: 0.599, beyond: 0.601}
+    measured = {"frame_us": 14.9, "megabytes": 1.0, "bake_seconds": 1.0, "fit_seconds": 1.0}
+    monkeypatch.setattr(Search, "_verify", lambda search, plan: {"relative_rmse": reached[plan], **measured})
+    monkeypatch.setattr(search.planner, "rank", lambda plan: (-1.0 if plan == beyond else -2.0, 0.0, 0.0))
+    proposing(search, monkeypatch, within, beyond)
+    outcome = search.run()
+    assert outcome.met
+    assert outcome.plan == within
+
+
 def test_no_more_bakes_than_allowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     search = searching(tmp_path, tune__max_relative_rmse=0.3, tune__trials=2)
     bench = Bench(monkeypatch)

@@ -32,9 +32,10 @@ from ddprt.dataset import store
 from ddprt.dataset.denoise import find_denoiser
 from ddprt.dataset.forecast_indirect import expect_indirect
 from ddprt.dataset.generate import baked_settings, check_points, sunk
+from ddprt.dataset.manifest import Manifest, map_name
 from ddprt.dataset.sampled import Expected, Part, Sampled
 from ddprt.dataset.splits import choose_lightings, doubt
-from ddprt.dataset.store import ATLAS_FILES, Manifest, map_name
+from ddprt.dataset.store import ATLAS_FILES
 from ddprt.files import write_tensors
 from ddprt.lights import Lighting, lighting_json
 from ddprt.machine import peak_memory_gib
@@ -185,7 +186,7 @@ def _placed(job: Sampled, samples: Samples, entries: list[tuple[str, Lighting]])
     store.write_description(job.folder, {**baked_settings(job.config, job.scene), "lightings": records})
     places = {"position": samples.position, "normal": samples.normal, "albedo": samples.albedo}
     write_tensors(job.folder / "points.safetensors", {**places, "spacing": np.zeros(1), "depth": np.zeros(1)})
-    write_tensors(job.folder / "scene.safetensors", {"corners": job.scene.corners, "uv": job.atlas.uv})
+    write_tensors(job.folder / "scene.safetensors", store.scene_tensors(job.scene, job.atlas))
     for name in ("points.safetensors", "scene.safetensors"):
         job.manifest.add(name)
     store.write_atlas(job.folder, job.atlas, job.manifest)

@@ -10,8 +10,9 @@ import numpy as np
 from ddprt import seeds
 from ddprt.axes import Float32, Int
 from ddprt.dataset.denoise import denoised
+from ddprt.dataset.manifest import map_name
 from ddprt.dataset.sampled import Expected, Number, Part, Sampled, extrapolated, on_a_line, scratched
-from ddprt.dataset.store import map_name, read_map, write_map
+from ddprt.dataset.store import read_map, write_map
 from ddprt.lights import Lighting
 from ddprt.transport.direct import Texels
 

@@ -15,12 +15,13 @@ import numpy as np
 
 from ddprt import __version__, seeds
 from ddprt.config import Config, checked
-from ddprt.dataset import store
+from ddprt.dataset import probes, store
 from ddprt.dataset.denoise import find_denoiser
 from ddprt.dataset.indirect import IndirectBake
+from ddprt.dataset.manifest import Manifest, map_name
 from ddprt.dataset.scratch import remove_left
 from ddprt.dataset.splits import SPLITS, Once, Splits, check_choice, choose_lightings, chosen, doubt, grouped
-from ddprt.dataset.store import Dataset, Manifest, map_name
+from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.files import alone_in, write_tensors
 from ddprt.lights import Lighting, lighting_json
@@ -111,6 +112,7 @@ def baked_settings(config: Config, scene: Scene) -> dict[str, Any]:
         "seed": config.seed,
         "transport": transport | {"integrator": "operator" if transport["integrator"] == "auto" else transport["integrator"]},
         "placing": config.points.model_dump(exclude={"quantity"}),
+        "layers": probes.probe_layers(config, scene),
     }
 
 
@@ -127,7 +129,7 @@ def other_settings(description: dict[str, Any], config: Config, scene: Scene) ->
 
 def differences(description: dict[str, Any], wanted: dict[str, Any]) -> str:
     """Where a baked dataset differs from what is asked for: "transport.samples: holds 16, asked 17"; empty if nowhere."""
-    holds = {**description, "counts": _counts(description.get("lightings", []))}
+    holds = {"layers": [], **description, "counts": _counts(description.get("lightings", []))}
     lines: list[str] = []
     for key, value in wanted.items():
         _compare(_SAID.get(key, key), holds.get(key, ...), value, lines)
@@ -234,7 +236,7 @@ class _Bake:
                 entries, samples, shadow_rays = chosen(entries, samples, self.config, self.tracer, self.first, self.once)
                 stage.facts |= {"train": sum(split == "train" for split, _ in entries), "shadow_rays": shadow_rays}
             lightings = [lighting for _, lighting in entries]
-        effects = plan(self.scene, lightings, bounces=self.config.transport.bounces)
+        effects = plan(self.scene, lightings, bounces=self.config.transport.bounces, probes=self.config.probes.asked)
         if self.config.transport.integrator in ("paths", "reference"):  # the operator tells what it left out, if anything
             for effect in effects.effects:
                 if effect.bound is None and not effect.forced:
@@ -250,9 +252,7 @@ class _Bake:
         dataset = Dataset(self.folder, description, keep_alive)
         self._direct(dataset, manifest, atlas, samples)
         self._judge_lightings(dataset, fresh=there is None)
-        indirect = IndirectBake(self.config, self.scene, self.tracer, atlas, effects, dataset, manifest, self.progress)
-        indirect.run("train", dataset.split("train") + dataset.split("validation"))
-        indirect.run("test", dataset.split("test"))
+        IndirectBake(self.config, self.scene, self.tracer, atlas, effects, dataset, manifest, self.progress).all()
         self._end(description)
         return dataset
 
@@ -274,7 +274,7 @@ class _Bake:
         return {
             "schema": store.SCHEMA,
             "ddprt": __version__,
-            **baked_settings(self.config, self.scene),
+            **{key: value for key, value in baked_settings(self.config, self.scene).items() if value != []},
             "quantity": "irradiance",
             "unit": "W/m2",
             "points": self._points(samples),
@@ -333,7 +333,7 @@ class _Bake:
             write_tensors(self.folder / "points.safetensors", {**tensors, **spans})
             manifest.add("points.safetensors")
         if not manifest.holds("scene.safetensors"):
-            write_tensors(self.folder / "scene.safetensors", {"corners": self.scene.corners, "uv": atlas.uv})
+            write_tensors(self.folder / "scene.safetensors", store.scene_tensors(self.scene, atlas))
             manifest.add("scene.safetensors")
         if not all(manifest.holds(name) for name in store.ATLAS_FILES):
             store.write_atlas(self.folder, atlas, manifest)

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache, cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,11 @@ from ddprt import seeds
 from ddprt.axes import Float32, Int
 from ddprt.config import Config
 from ddprt.dataset.denoise import denoised
+from ddprt.dataset.manifest import Manifest, map_name
+from ddprt.dataset.probes import ProbeBake, Sent
 from ddprt.dataset.sampled import scratched, stored
 from ddprt.dataset.scratch import Scratch
-from ddprt.dataset.store import Dataset, Manifest, map_name, read_map, write_map
+from ddprt.dataset.store import CONSTANT, Dataset, read_map, write_map
 from ddprt.progress import Progress, Stage
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
@@ -44,8 +47,28 @@ class IndirectBake:
     manifest: Manifest
     progress: Progress
 
+    def all(self) -> None:
+        """Bakes whatever is missing."""
+        self.run("train", self.dataset.split("train") + self.dataset.split("validation"))
+        self.run("test", self.dataset.split("test"))
+        self.constant()
+
     def run(self, split: str, indices: list[int]) -> None:
-        """Bakes the maps of lightings that share their gather rays: "train" (with validation), or "test"."""
+        """Bakes lightings that share their gather rays: "train" (with validation), or "test"."""
+        sent: Callable[[int], Sent] = partial(self._sent, split, indices)
+        if self._probes:
+            sent = cache(sent)  # of maps and probes
+        self._maps(split, indices, sent)
+        if self._probes:
+            dark = self.config.transport.bounces == 0 or not any(max(entry.albedo) for entry in self.scene.materials)
+            self._probes.run(split, indices, sent, self.progress, dark=dark)
+
+    @cached_property
+    def _probes(self) -> ProbeBake | None:
+        scene = self.scene, self.tracer, self.atlas
+        return ProbeBake.of(self.effects, self.config, *scene, self.dataset, self.manifest)
+
+    def _maps(self, split: str, indices: list[int], sent: Callable[[int], Sent]) -> None:
         kinds = ["indirect", "noise"] if split == "test" else ["indirect"]
         todo = self.manifest.lacks(kinds, indices)
         if not todo:
@@ -61,24 +84,59 @@ class IndirectBake:
             elif self.dataset.description["transport"]["integrator"] == "paths":
                 self._by_paths(split, indices, todo, kinds, stage)
             else:
-                self._by_operator(split, indices, todo, kinds, stage)
+                self._by_operator(split, indices, todo, kinds, stage, sent)
             stage.facts["rays"] = self.tracer.rays - before
 
-    def _by_operator(self, split: str, indices: list[int], todo: list[int], kinds: list[str], stage: Stage) -> None:
-        from ddprt.transport.effort import choose_rays
+    def constant(self) -> None:
+        """Bakes the light of what glows, if a plan calls for it."""
+        emission = self.effects.module("emission")
+        if emission is None or self.manifest.holds(CONSTANT):
+            return
+        config, before = self.config.transport, self.tracer.rays
+        with self.progress.stage("emission") as stage:
+            address = {"seed": self.config.seed, "bounces": self.effects.bounces}
+            found = emission.constant_light(self.scene, self.tracer, self.atlas, config, **address)
+            if config.test_samples == "auto" and found.relative > 1.5 * config.target_noise:
+                self.progress.warn(
+                    f"transport.target_noise: got {config.target_noise:g}, but the most samples that are taken unasked leave "
+                    f"{found.relative:.2g} in the light of emissive surfaces; raise it, or set transport.test_samples"
+                )
+            write_map(self.dataset.folder / CONSTANT, self.atlas.image(found.irradiance))
+            self.manifest.add(CONSTANT)
+            stage.facts |= found.facts | {"rays": self.tracer.rays - before}
+
+    @cached_property
+    def _operator(self) -> Any:
         from ddprt.transport.operator import Operator
 
+        return Operator.of(self.tracer, self.atlas, self.config.transport.sender_resolution)
+
+    def _sent(self, split: str, indices: list[int], half: int) -> Sent:
+        """What the senders of a half of a split send to its lightings' maps and probes."""
+        operator, stream = self._operator, f"{split} {half}"
+        bounces = self.effects.bounces or 1  # of a lonely convex body, whose light reaches probes alone
+        direct = self._averaged(operator, indices, half)
+        bounced = operator.bounce(direct, seed=self.config.seed, stream=stream, bounces=bounces)
+        near = operator.near([self.dataset.lightings[index] for index in indices], direct, bounces=bounces)
+        return Sent(operator, bounced, {"seed": self.config.seed, "stream": stream, "near": near})
+
+    def _by_operator(
+        self,
+        split: str,
+        indices: list[int],
+        todo: list[int],
+        kinds: list[str],
+        stage: Stage,
+        sent: Callable[[int], Sent],
+    ) -> None:
+        from ddprt.transport.effort import choose_rays
+
         config, test = self.config.transport, split == "test"
-        operator = Operator.of(self.tracer, self.atlas, config.sender_resolution)
-        lightings = [self.dataset.lightings[index] for index in indices]
         parts, rays, footprints = [], None, None
         begun = time.perf_counter()
         for half in range(len(kinds)):
-            stream = f"{split} {half}"
-            direct = self._averaged(operator, indices, half)
-            bounced = operator.bounce(direct, seed=self.config.seed, stream=stream, bounces=self.effects.bounces)
-            near = operator.near(lightings, direct, bounces=self.effects.bounces)
-            address: dict[str, Any] = {"seed": self.config.seed, "stream": stream, "near": near}
+            light = sent(half)
+            operator, bounced, address = light.operator, light.bounced, light.address
             if rays is None:
                 bouncing = time.perf_counter() - begun
                 chosen = choose_rays(operator, bounced.radiosity, config, held_out=test, **address)

@@ -15,7 +15,8 @@ import numpy as np
 
 from ddprt import harmonics
 from ddprt.axes import Bool, Float32, Float64
-from ddprt.dataset.store import Dataset, Manifest, layer_name
+from ddprt.dataset.manifest import Manifest, layer_name
+from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.files import read_tensors, write_tensors
 
@@ -87,7 +88,8 @@ def read_layer(data: Dataset, name: str) -> Layer:
     if name not in found:
         raise UserError(f'{data.folder}: got no layer "{name}", expected one of {sorted(found)}; bake with that effect')
     places = read_tensors(data.folder / layer_name(name, "places"))
-    return Layer(**found[name], position=places["position"], weight=places["weight"], texel=places["texel"])
+    kind = {key: found[name][key] for key in ("name", "quantity", "order")}
+    return Layer(**kind, position=places["position"], weight=places["weight"], texel=places["texel"])
 
 
 def layers(data: Dataset) -> list[Layer]:

@@ -12,8 +12,9 @@ import numpy as np
 from ddprt import seeds
 from ddprt.axes import Float32
 from ddprt.config import Config
+from ddprt.dataset.manifest import Manifest
 from ddprt.dataset.scratch import Scratch, remove_left
-from ddprt.dataset.store import Manifest, write_map
+from ddprt.dataset.store import write_map
 from ddprt.files import sha256, write_text
 from ddprt.lights import Lighting
 from ddprt.machine import peak_memory_gib

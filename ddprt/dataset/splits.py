@@ -26,7 +26,7 @@ Splits = Mapping[str, Sequence[Lighting]]
 Given = ParamSpec("Given")
 Result = TypeVar("Result")
 
-_STRENGTHS = ("intensity", "irradiance", "radiance")
+_STRENGTHS = ("intensity", "irradiance", "radiance", "scale")
 
 
 class Once:
@@ -215,7 +215,7 @@ def doubt(lighting: Lighting, lights_nothing: bool, scene: Scene, tracer: Tracer
     places = [anchor for light in lighting if (anchor := light.anchor()) is not None]
     all_placed = len(places) == len(lighting)
     prefix = "lights nothing: it " if lights_nothing else ""
-    strengths = [value for light in lighting_json(lighting) for key in _STRENGTHS for value in light.get(key, ())]
+    strengths = [value for light in lighting_json(lighting) for key in _STRENGTHS for value in np.ravel(light.get(key, ()))]
     if not any(strengths):
         return prefix + "has no intensity"
     if all_placed and not (tracer.clearance(np.array(places)) > 0).any():

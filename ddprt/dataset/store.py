@@ -6,8 +6,7 @@ goes on from there.
 """
 
 import json
-import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -17,28 +16,22 @@ from typing import Any
 import numpy as np
 
 from ddprt.axes import Bool, Float32, Float64
+from ddprt.dataset.manifest import Manifest, layer_name, map_name
 from ddprt.dataset.pack import Pack, Shelf, Stored, remove_packs
 from ddprt.errors import UserError
-from ddprt.files import make_folder, read_tensors, sha256, write_text
+from ddprt.files import make_folder, read_tensors, write_text
 from ddprt.lights import Lighting, parse_lighting
 from ddprt.sampling.points import Samples
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.exr import exposure_for, read_exr, write_exr
+from ddprt.scene.holes import Holes
+from ddprt.scene.mesh import Scene
 
 SCHEMA = 1
 _GBUFFER = ("position", "normal", "geometric_normal", "albedo", "area", "coverage")
+CONSTANT = "constant.exr"
+"""Light of what glows in the scene, where a plan calls for it."""
 ATLAS_FILES = tuple(f"atlas/{name}.exr" for name in _GBUFFER)
-
-
-def map_name(kind: str, index: int) -> str:
-    """Relative path of a lighting's map; kind is "direct", "indirect", "noise" or "measured"."""
-    return f"{kind}/{index:06d}.{'safetensors' if kind == 'measured' else 'exr'}"
-
-
-def layer_name(layer: str, index: int | str, kind: str = "light") -> str:
-    """Relative path of a lighting's coefficients in a layer, or of its "places"; kind is "light" or "noise"."""
-    stem = index if isinstance(index, str) else f"{index:06d}{'' if kind == 'light' else f'.{kind}'}"
-    return f"{layer}/{stem}.safetensors"
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +101,20 @@ class Dataset:
         """Lightmap coordinates of these corners, origin top-left; None in bakes of older versions."""
         return read_tensors(self.folder / "scene.safetensors").get("uv")
 
+    @cached_property
+    def holes(self) -> Holes | None:
+        """Where rays pass through these triangles; None where they nowhere do.
+
+        Raises:
+          UserError: the masks do not fit the triangles.
+        """
+        path = self.folder / "scene.safetensors"
+        tensors = read_tensors(path)
+        try:
+            return Holes.read(tensors, len(tensors["corners"]))
+        except ValueError as error:
+            raise UserError(f"{path}: {error}; bake it again") from None
+
     def maps(self, kind: str, indices: Sequence[int]) -> Float32[np.ndarray, "lightings texels 3"]:
         """Lightmaps of the covered texels in W/m²; kind is "direct", "indirect" or (held-out lightings) "noise"."""
         if kind == "indirect":
@@ -136,6 +143,16 @@ class Dataset:
             return image, exposure
 
         return self._shelf.fill([map_name("indirect", i) for i in range(len(self.lightings))], self.covered, read)
+
+    @cached_property
+    def constant(self) -> Float32[np.ndarray, "texels 3"] | None:
+        """Irradiance of emissive surfaces, W/m², in no other map of the dataset; None where none was baked."""
+        if not _glows(self.description):
+            return None
+        path = self.folder / CONSTANT
+        values = _light(*self._stored(path))[self.covered]
+        _refuse_odd(path, values)
+        return values
 
     @cached_property
     def _shelf(self) -> Shelf:
@@ -221,7 +238,7 @@ def read_description(folder: Path) -> dict[str, Any]:
 
 def expected_files(description: dict[str, Any]) -> list[str]:
     """Names of all files of a finished dataset."""
-    names = ["scene.safetensors", "points.safetensors", *ATLAS_FILES]
+    names = ["scene.safetensors", "points.safetensors", *ATLAS_FILES, *([CONSTANT] if _glows(description) else [])]
     for index, entry in enumerate(description["lightings"]):
         kinds = ["direct", "measured", "indirect", *(["noise"] if entry["split"] == "test" else [])]
         names += [map_name(kind, index) for kind in kinds]
@@ -232,76 +249,8 @@ def expected_files(description: dict[str, Any]) -> list[str]:
     return names
 
 
-class Manifest:
-    """The list of whole files of a folder; appending is safe against being killed at any moment."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.path = folder / "manifest.jsonl"
-        self.entries: dict[str, dict[str, Any]] = {}
-        self._whole = 0
-        try:
-            raw = self.path.read_bytes()
-        except FileNotFoundError:
-            return
-        except OSError as error:
-            raise UserError(f"{self.path}: cannot be read ({error.strerror or error}); mend the folder's permissions") from None
-        for line in raw.splitlines(keepends=True):
-            try:
-                entry = json.loads(line)
-                name = entry["file"]
-            except (ValueError, KeyError, TypeError):
-                break  # a line cut short by a kill: it and all after it do not count
-            if not line.endswith(b"\n"):
-                break
-            self.entries[name] = entry
-            self._whole += len(line)
-
-    def add(self, name: str) -> None:
-        """Names a file that has just been moved into place; naming the same contents again adds nothing."""
-        path = self.folder / name
-        entry = {"file": name, "bytes": path.stat().st_size, "sha256": sha256(path)}
-        if self.entries.get(name) == entry:
-            return
-        line = (json.dumps(entry) + "\n").encode()
-        try:
-            with self.path.open("r+b" if self.path.exists() else "wb") as file:
-                file.truncate(self._whole)
-                file.seek(self._whole)
-                file.write(line)
-                file.flush()
-                os.fsync(file.fileno())
-        except OSError as error:
-            raise UserError(f"{self.path}: cannot be written ({error.strerror or error}); free some space") from None
-        self._whole += len(line)
-        self.entries[name] = entry
-
-    def holds(self, name: str) -> bool:
-        """Whether a file is named and still there in its full length."""
-        entry = self.entries.get(name)
-        path = self.folder / name
-        return entry is not None and path.is_file() and path.stat().st_size == entry["bytes"]
-
-    def fits(self, name: str) -> bool:
-        """Whether the contents of a named file are those of its hash."""
-        return bool(sha256(self.folder / name) == self.entries[name]["sha256"])
-
-    def lacks(self, kinds: Sequence[str], indices: Iterable[int]) -> list[int]:
-        """The lightings that some kind of map is still missing of."""
-        return [index for index in indices if not all(self.holds(map_name(kind, index)) for kind in kinds)]
-
-    def damaged(self) -> list[str]:
-        """One line for each named file that is missing or differs from its hash."""
-        faults = []
-        for name, entry in self.entries.items():
-            path = self.folder / name
-            if not path.is_file():
-                faults.append(f"{name}: missing")
-            elif path.stat().st_size != entry["bytes"]:
-                faults.append(f"{name}: got {path.stat().st_size} bytes, expected {entry['bytes']}")
-            elif not self.fits(name):
-                faults.append(f"{name}: contents differ from their hash")
-        return faults
+def _glows(description: dict[str, Any]) -> bool:
+    return any(entry["called"] for entry in description.get("plan", ()) if entry["name"] == "emission")
 
 
 def write_map(path: Path, image: Float32[np.ndarray, "height width 3"]) -> None:
@@ -350,6 +299,12 @@ def write_atlas(folder: Path, atlas: Atlas, manifest: Manifest) -> None:
         image = atlas.image(values.reshape(atlas.count, -1))
         write_exr(folder / "atlas" / f"{name}.exr", image)
         manifest.add(f"atlas/{name}.exr")
+
+
+def scene_tensors(scene: Scene, atlas: Atlas) -> dict[str, np.ndarray]:
+    """What a dataset keeps of a scene: what casts shadows, and where it lies on the lightmap."""
+    holes = Holes.of(scene)
+    return {"corners": scene.corners, "uv": atlas.uv, **(holes.tensors if holes else {})}
 
 
 def write_description(folder: Path, description: dict[str, Any]) -> None:

@@ -21,6 +21,7 @@ from ddprt.scene.gutter import fill_gutter
 
 SCHEMA = 1
 LAYER = 4  # bases per RGBA texture
+CONSTANT = "constant.exr"
 
 DECODE = [
     "home = points.home; x[p] = mean over samples k with home[k] == p of (albedo[k] *) E_direct[k], per colour channel",
@@ -33,6 +34,7 @@ DECODE = [
     "y = max(y, 0); in gamma space y = y^gamma; E_indirect = s * y, in W/m²; radiance = albedo / pi * E_indirect",
 ]
 
+GLOWING = "E = E_indirect + constant texture, added after the sum, the clamp, gamma and s: light of surfaces that glow"
 
 TRUST = [
     "x as above, encoded: z; per channel for mono, over all for multi; weight of a channel w = s² / sum of s²",
@@ -79,6 +81,9 @@ def export_textures(
     images = [image / size for image, size in zip(images, scale, strict=False)]
     half = precision == "half"
     written, layers = [], []
+    constant = None
+    if model.constant is not None:
+        (constant,), _ = _stitched(model, [_image(model, model.constant, gutter)], gutter, stitch)
     if mono:
         for first in range(0, len(images), LAYER):
             group = images[first : first + LAYER]
@@ -88,12 +93,16 @@ def export_textures(
         layers = [(f"basis_{index:02d}.exr", image) for index, image in enumerate(images)]
     layers += [("mean.exr", image) for image in mean]
     kept = {name for name, _ in layers}
-    for stale in [*folder.glob("basis_*.exr"), *folder.glob("mean.exr")]:
+    kept |= set() if constant is None else {CONSTANT}
+    for stale in [*folder.glob("basis_*.exr"), *folder.glob("mean.exr"), *folder.glob(CONSTANT)]:
         if stale.name not in kept:  # of an earlier export with more bases
             stale.unlink()
     for name, image in layers:
         write_exr(folder / name, image, half=half)
         written.append(folder / name)
+    if constant is not None:  # in W/m², which halves may not reach
+        write_exr(folder / CONSTANT, constant, half=False)
+        written.append(folder / CONSTANT)
 
     points = {
         "position": model.samples.position,
@@ -138,9 +147,11 @@ def export_textures(
         "matrix": {"file": "transfer.safetensors", "axes": "rgb, bases, points" if mono else "1, bases, points * rgb"},
         "uv": "lightmap coordinates (TEXCOORD_1), origin top-left, row 0 at the top",
         "unit": "irradiance in W/m2, before albedo",
-        "decode": DECODE,
+        "decode": DECODE if constant is None else [*DECODE, GLOWING],
         "trust": trust,
     }
+    if constant is not None:
+        manifest["constant"] = CONSTANT
     write_text(folder / "manifest.json", json.dumps(manifest, indent=1, ensure_ascii=False) + "\n")
     return [*written, folder / "transfer.safetensors", folder / "points.json", folder / "manifest.json"]
 

@@ -1,7 +1,7 @@
 """What moves: lights, and lightings (lists of lights that are on together).
 
-Enters: JSON or Python records. Leaves: irradiance, direction and distance for any point, never knowing what stands in
-between. Geometry, rays and randomness never enter; random numbers come in as arguments.
+Enters: JSON or Python records, pictures of skies. Leaves: irradiance, direction and distance for any point, never knowing
+what stands in between. Geometry, rays and randomness never enter; random numbers come in as arguments.
 """
 
 import json
@@ -14,19 +14,30 @@ from ddprt.catalogue import Catalogue
 from ddprt.errors import UserError, explain, nearest, spoken
 from ddprt.lights.area import RectLight, SphereLight
 from ddprt.lights.distant import DirectionalLight
+from ddprt.lights.environment import EnvironmentLight
 from ddprt.lights.light import Light
+from ddprt.lights.mesh import MeshLight
 from ddprt.lights.point import PointLight, SpotLight
 
 LIGHTS: Catalogue[type] = Catalogue(
     "light type",
-    {light.kind: light for light in (PointLight, SpotLight, DirectionalLight, RectLight, SphereLight)},
+    {
+        light.kind: light
+        for light in (PointLight, SpotLight, DirectionalLight, RectLight, SphereLight, EnvironmentLight, MeshLight)
+    },
 )
 Lighting = tuple[Light, ...]
 """Lights that are on together."""
 
 _EXAMPLE = '[{"type": "point", "position": [0, 1, 0], "intensity": [1, 1, 1]}]'
 _ADAPTER: TypeAdapter[Any] = TypeAdapter(
-    tuple[Annotated[PointLight | SpotLight | DirectionalLight | RectLight | SphereLight, Field(discriminator="type")], ...]
+    tuple[
+        Annotated[
+            PointLight | SpotLight | DirectionalLight | RectLight | SphereLight | EnvironmentLight | MeshLight,
+            Field(discriminator="type"),
+        ],
+        ...,
+    ]
 )
 
 
@@ -104,8 +115,10 @@ def lighting_json(lighting: Lighting) -> list[dict[str, Any]]:
 __all__ = [
     "LIGHTS",
     "DirectionalLight",
+    "EnvironmentLight",
     "Light",
     "Lighting",
+    "MeshLight",
     "PointLight",
     "RectLight",
     "SphereLight",

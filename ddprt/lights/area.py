@@ -31,10 +31,14 @@ class RectLight(LightModel):
         return self
 
     def illuminate(
-        self, points: Float[np.ndarray, "n 3"], u: Float[np.ndarray, "n 2"], out: Illumination | None = None
+        self,
+        points: Float[np.ndarray, "n 3"],
+        u: Float[np.ndarray, "n 2"],
+        out: Illumination | None = None,
+        normals: Float[np.ndarray, "n 3"] | None = None,
     ) -> Illumination:
         """See `Light`."""
-        out = out or Illumination.at(points)
+        out = Illumination.at(points, out)
         out.colour[:] = self.radiance
         sides = np.array([self.half_u, self.half_v])
         where = place(self.center, points)
@@ -73,10 +77,14 @@ class SphereLight(LightModel):
     radiance: Colour
 
     def illuminate(
-        self, points: Float[np.ndarray, "n 3"], u: Float[np.ndarray, "n 2"], out: Illumination | None = None
+        self,
+        points: Float[np.ndarray, "n 3"],
+        u: Float[np.ndarray, "n 2"],
+        out: Illumination | None = None,
+        normals: Float[np.ndarray, "n 3"] | None = None,
     ) -> Illumination:
         """See `Light`."""
-        out = out or Illumination.at(points)
+        out = Illumination.at(points, out)
         out.colour[:] = self.radiance
         where = place(self.center, points)
         _ball(columns(points), columns(u), where, self.radius, out.direction.T, out.distance, out.strength)

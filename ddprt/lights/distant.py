@@ -18,10 +18,14 @@ class DirectionalLight(LightModel):
     irradiance: Colour
 
     def illuminate(
-        self, points: Float[np.ndarray, "n 3"], u: Float[np.ndarray, "n 2"], out: Illumination | None = None
+        self,
+        points: Float[np.ndarray, "n 3"],
+        u: Float[np.ndarray, "n 2"],
+        out: Illumination | None = None,
+        normals: Float[np.ndarray, "n 3"] | None = None,
     ) -> Illumination:
         """See `Light`."""
-        out = out or Illumination.at(points)
+        out = Illumination.at(points, out)
         out.direction.T[:] = -unit(np.array(self.direction))[:, None]
         out.distance[:], out.strength[:], out.colour[:] = np.inf, 1, self.irradiance
         return out

@@ -4,7 +4,7 @@ Lights are frozen pydantic models: their JSON is validated with the same one-lin
 are float32 or float64 NumPy, world space, metres.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
@@ -13,8 +13,9 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from ddprt.axes import Float, Float64
 
 _LARGEST = 1e30  # W/sr and the like: its square still has room in the exponent of the sums that follow
-_FARTHEST = 1e12  # metres: its square still fits into float32
-Coordinate = Annotated[float, Field(ge=-_FARTHEST, le=_FARTHEST)]
+FARTHEST = 1e12
+"""Metres: its square still fits into float32."""
+Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
 Strength = Annotated[float, Field(ge=0, le=_LARGEST)]
 Vector = tuple[Coordinate, Coordinate, Coordinate]
 Colour = tuple[Strength, Strength, Strength]
@@ -29,7 +30,7 @@ def _not_zero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
 def _normalised(vector: tuple[float, float, float]) -> tuple[float, float, float]:
     """Unit length, in float64 and safe at any size; a unit vector stays as it is, so that reading back changes nothing."""
     relative = np.array(_not_zero(vector)) / max(map(abs, vector))
-    length = float(np.linalg.norm(np.array(vector))) if max(map(abs, vector)) < _FARTHEST else np.inf
+    length = float(np.linalg.norm(np.array(vector))) if max(map(abs, vector)) < FARTHEST else np.inf
     if abs(length - 1) < 1e-12:
         return vector
     x, y, z = (relative / np.linalg.norm(relative)).tolist()
@@ -55,24 +56,36 @@ class Illumination:
       distance: metres that a shadow ray must cross; infinity for distant lights.
       strength: how much of `colour` arrives on a plane that faces `direction`, divided by the sampling density.
       colour: the light's intensity, irradiance or radiance.
+      tint: what `colour` is multiplied by at each point; None where the light has one colour.
     """
 
     direction: Float[np.ndarray, "n 3"]
     distance: Float[np.ndarray, " n"]
     strength: Float[np.ndarray, " n"]
     colour: Float64[np.ndarray, "3"]
+    tint: Float[np.ndarray, "n 3"] | None = None
 
     @classmethod
-    def at(cls, points: Float[np.ndarray, "n 3"]) -> "Illumination":
-        """Arrays to be filled, for as many points and of their type."""
+    def at(cls, points: Float[np.ndarray, "n 3"], out: "Illumination | None" = None) -> "Illumination":
+        """Arrays to be filled, for as many points and of their type; those of `out` if given, without its tint."""
+        if out is not None:
+            return out if out.tint is None else replace(out, tint=None)
         count, dtype = len(points), points.dtype
         return cls(np.empty((3, count), dtype).T, np.empty(count, dtype), np.empty(count, dtype), np.zeros(3))
+
+    @classmethod
+    def tinted(cls, points: Float[np.ndarray, "n 3"], out: "Illumination | None" = None) -> "Illumination":
+        """The same with a colour for each point."""
+        if out is not None and out.tint is not None:
+            return out
+        return replace(out or cls.at(points), tint=np.empty((3, len(points)), points.dtype).T)
 
     @property
     def irradiance(self) -> Float[np.ndarray, "n 3"]:
         """W/m² on a plane that faces `direction`, divided by the sampling density; infinity where that is too much."""
+        colour = self.colour if self.tint is None else self.colour * self.tint
         with np.errstate(over="ignore"):
-            return (self.strength[:, None] * self.colour).astype(self.strength.dtype)
+            return (self.strength[:, None] * colour).astype(self.strength.dtype)
 
 
 @runtime_checkable
@@ -88,11 +101,16 @@ class Light(Protocol):
     delta: ClassVar[bool]
 
     def illuminate(
-        self, points: Float[np.ndarray, "n 3"], u: Float[np.ndarray, "n 2"], out: Illumination | None = None
+        self,
+        points: Float[np.ndarray, "n 3"],
+        u: Float[np.ndarray, "n 2"],
+        out: Illumination | None = None,
+        normals: Float[np.ndarray, "n 3"] | None = None,
     ) -> Illumination:
         """Samples the light from each point: the mean over uniform `u` of irradiance * cosine * visible is E.
 
-        Fills and returns `out` if given: fresh memory for every block of points would cost more than the arithmetic.
+        Fills and returns `out` if given (with a tint or without, as the light is): fresh memory for every block of points would
+        cost more than the arithmetic. Light from all around is sampled better where `normals` are known; others ignore them.
         """
         ...
 

@@ -20,10 +20,14 @@ class PointLight(LightModel):
     intensity: Colour
 
     def illuminate(
-        self, points: Float[np.ndarray, "n 3"], u: Float[np.ndarray, "n 2"], out: Illumination | None = None
+        self,
+        points: Float[np.ndarray, "n 3"],
+        u: Float[np.ndarray, "n 2"],
+        out: Illumination | None = None,
+        normals: Float[np.ndarray, "n 3"] | None = None,
     ) -> Illumination:
         """See `Light`; a point on the lamp itself receives nothing, since no cosine is defined there."""
-        out = out or Illumination.at(points)
+        out = Illumination.at(points, out)
         out.colour[:] = self.intensity
         _point(columns(points), place(self.position, points), out.direction.T, out.distance, out.strength)
         return out
@@ -64,10 +68,14 @@ class SpotLight(LightModel):
         return self
 
     def illuminate(
-        self, points: Float[np.ndarray, "n 3"], u: Float[np.ndarray, "n 2"], out: Illumination | None = None
+        self,
+        points: Float[np.ndarray, "n 3"],
+        u: Float[np.ndarray, "n 2"],
+        out: Illumination | None = None,
+        normals: Float[np.ndarray, "n 3"] | None = None,
     ) -> Illumination:
         """See `Light`."""
-        out = out or Illumination.at(points)
+        out = Illumination.at(points, out)
         out.colour[:] = self.intensity
         _point(columns(points), place(self.position, points), out.direction.T, out.distance, out.strength)
         inner, outer = 2 * np.sin(np.deg2rad([self.inner_deg, self.outer_deg]) / 2) ** 2

@@ -109,6 +109,10 @@ def evaluate(data: Dataset, models: Mapping[str, Model], fit_seconds: Mapping[st
             "ridge_chosen_by": report.ridge_chosen_by,
         },
     }
+    if main.layers:
+        from ddprt.report.layers import layer_scores
+
+        metrics["layers"] = layer_scores(data, main)
     evaluation = Evaluation(metrics, truth, values, predicted)
     evaluation.distance = _distance_to_surface(data, main, test)
     return evaluation
@@ -319,11 +323,11 @@ def _bake_variance(brightness: np.ndarray, noise: np.ndarray) -> np.ndarray:
 
 def _frame_by_frame(model: Model, values: np.ndarray, lightings: Sequence[Any]) -> tuple[np.ndarray, float]:
     """Unclamped prediction of every frame through the public API, and the median seconds of one, compiled before."""
-    model.predict(values[0], lightings=lightings[0], clamp=False)
+    model.predict(values[0], lightings=lightings[0], clamp=False, constant=False)
     light, seconds = [], []
     for frame, lighting in zip(values, lightings, strict=True):
         start = time.perf_counter()
-        light.append(model.predict(frame, lightings=lighting, clamp=False))
+        light.append(model.predict(frame, lightings=lighting, clamp=False, constant=False))
         seconds.append(time.perf_counter() - start)
     return np.stack(light), float(np.median(seconds))
 

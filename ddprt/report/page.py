@@ -170,7 +170,7 @@ def warnings(
     for effect in effects:
         if effect.forced or effect.bound is None or (not effect.called and effect.bound > _BOUND):
             most = None if effect.bound is None else words.percent(effect.bound)
-            share = f"at most {most} of the largest direct" if most else "an unbounded amount of"
+            share = f"at most {most} of the largest direct" if most else "an unbounded share of the largest direct"
             found.append((f"Effect cut short: {effect.name}", f"{effect.why}; {share} irradiance is left out."))
     return [*found, *(("Scene repaired on loading", note) for note in notes)]
 

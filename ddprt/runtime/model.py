@@ -20,6 +20,7 @@ from ddprt.methods.method import AsksForLights, Frame, Relighter
 from ddprt.runtime.coefficients import Coefficients
 from ddprt.runtime.trust import Trust, Yardstick
 from ddprt.sampling.points import Samples
+from ddprt.scene.holes import Holes
 
 _LARGEST = float(np.finfo(np.float32).max)
 _NOT_FINITE = "values: got NaN or infinity in float32, expected finite W/m²; check how the points are shaded"
@@ -43,6 +44,8 @@ class Model:
       uv: lightmap coordinates of the occluders' corners, origin top-left; None in models of older versions.
       yardstick: what trust is measured with; None likewise.
       layers: what answers for light besides the lightmap, by name of the layer.
+      holes: where light passes through the occluders; None where it nowhere does.
+      constant: irradiance of emissive surfaces, which no light changes, W/m²; None where nothing glows.
     """
 
     method: str
@@ -58,9 +61,19 @@ class Model:
     uv: np.ndarray | None = None
     yardstick: Yardstick | None = None
     layers: "Mapping[str, LayerModel]" = field(default_factory=dict)
+    holes: Holes | None = None
+    constant: np.ndarray | None = None
 
-    def predict(self, values: Any, *, lightings: Any = None, clamp: bool | str = True, fade: bool = False) -> np.ndarray:
-        """Indirect irradiance from measured light.
+    def predict(
+        self,
+        values: Any,
+        *,
+        lightings: Any = None,
+        clamp: bool | str = True,
+        fade: bool = False,
+        constant: bool = True,
+    ) -> np.ndarray:
+        """Indirect irradiance from measured light, and the light of what glows.
 
         Args:
           values: (points, 3) or (frames, points, 3) measured light in W/m², of `quantity`.
@@ -68,6 +81,7 @@ class Model:
           clamp: cut negative light off, as an engine does; "energy": in the way that keeps the total of each frame and channel
             (see `ddprt.fitting.encoding.without_negatives`); False keeps it.
           fade: where trust is low, go over to the mean lightmap, as bright as the measurements are.
+          constant: add the light of emissive surfaces, where there are any, last; False leaves what the lights change.
         Returns:
           (texels, 3) or (frames, texels, 3) float32, W/m², covered texels in row-major order.
         Raises:
@@ -87,12 +101,16 @@ class Model:
         if fade and self.yardstick is not None:
             kept = self.yardstick.kept(self.yardstick.measure(self.encoding, frames).score)[:, None, None]
             scale = np.asarray(self.encoding.scale(frames), np.float64)[:, None]
-            faded = kept * light + (1 - kept) * (self.predict(self.yardstick.mean, clamp=clamp) * scale)
+            faded = kept * light + (1 - kept) * (self.predict(self.yardstick.mean, clamp=clamp, constant=False) * scale)
             light = np.where(kept < 1, np.clip(faded, -_LARGEST, _LARGEST), light).astype(np.float32)
+        if constant and self.constant is not None:
+            light = light + self.constant
         return light[0] if single else light
 
     def coefficients(self, values: Any) -> np.ndarray:
         """What each basis texture counts in a frame: y = max(0, sum of coefficients times `textures`)^gamma, in W/m².
+
+        What `constant` holds comes on top of y.
 
         The brightness of the frame is in them; a mean lightmap, where there is one, is the first texture. Quick: a few
         microseconds for one frame.
@@ -147,15 +165,18 @@ class Model:
         irradiance = measure(self._tracer, parsed, samples.position, samples.normal, seed=0, depth=samples.depth)
         return average_into_points(irradiance[None], self.samples, self.points, self.quantity)[0]
 
-    def relight(self, lighting: Lighting | Light | Sequence[dict[str, Any]] | dict[str, Any]) -> np.ndarray:
-        """Indirect lightmap of a lighting.
+    def relight(
+        self, lighting: Lighting | Light | Sequence[dict[str, Any]] | dict[str, Any], *, constant: bool = True
+    ) -> np.ndarray:
+        """Indirect lightmap of a lighting, and the light of what glows.
 
         Args:
           lighting: a light, several, or their JSON records.
+          constant: as for `predict`.
         Returns:
           (height, width, 3) float32 irradiance in W/m², row 0 at the top, 0 where nothing is covered.
         """
-        return self.image(self.predict(self.measure(lighting), lightings=lighting))
+        return self.image(self.predict(self.measure(lighting), lightings=lighting, constant=constant))
 
     def image(self, values: np.ndarray) -> np.ndarray:
         """Values of covered texels as an image."""
@@ -214,7 +235,7 @@ class Model:
     def _tracer(self) -> Any:
         from ddprt.transport.embree import Tracer
 
-        return Tracer(self.occluders)
+        return Tracer(self.occluders, holes=self.holes)
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,6 +23,7 @@ from ddprt.methods.method import FitReport
 from ddprt.runtime.model import LayerModel, Model
 from ddprt.runtime.trust import Yardstick
 from ddprt.sampling.points import Samples
+from ddprt.scene.holes import Holes
 
 SCHEMA = 1
 _PLACES = ("position", "weight", "texel")  # tensors of a layer
@@ -90,6 +91,10 @@ def save_model(model: Model, folder: Path) -> None:
     for name, part in model.layers.items():
         tensors |= {f"layers.{name}.{entry}": getattr(part.layer, entry) for entry in _PLACES}
         save_model(part.model, folder / "layers" / name)
+    if model.holes is not None:
+        tensors |= model.holes.tensors
+    if model.constant is not None:
+        tensors["light.constant"] = model.constant
     trust: dict[str, float] = {}
     if model.yardstick is not None:
         for entry in fields(model.yardstick):
@@ -211,6 +216,9 @@ def _assemble(
     uv = tensors.get("scene.uv")
     if uv is not None and uv.shape != (len(tensors["scene.corners"]), 3, 2):
         raise ValueError(f"got lightmap coordinates of shape {uv.shape}")
+    constant = tensors.get("light.constant")
+    if constant is not None and constant.shape != (int(tensors["atlas.covered"].sum()), 3):
+        raise ValueError(f"got constant light of shape {constant.shape}")
     position, normal, albedo = (tensors[f"points.{name}"] for name in ("position", "normal", "albedo"))
     samples = Samples(position, normal, albedo, places.spacing, places.depth)
     return Model(
@@ -227,6 +235,8 @@ def _assemble(
         uv,
         None if checked.trust is None else _yardstick(checked.trust, tensors),
         {entry.name: _layer_model(entry, tensors, parts[entry.name]) for entry in checked.layers},
+        Holes.read(tensors, len(tensors["scene.corners"])),
+        constant,
     )
 
 

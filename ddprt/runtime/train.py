@@ -132,6 +132,8 @@ def fit_method(
         data.uv,
         yardstick,
         {} if isinstance(data, LayerData) else {layer.name: of_layer(layer) for layer in layers(data)},
+        None if isinstance(data, LayerData) else data.holes,
+        None if isinstance(data, LayerData) else data.constant,
     )
 
 

@@ -51,6 +51,8 @@ def _moved(light: Light, towards: Float64[np.ndarray, "3"], room: float, step: f
     if light.anchor() is not None:
         return light.translated(step * room * towards)
     record = lighting_json((light,))[0]
+    if "rotation_deg" in record:
+        return parse_lighting([{**record, "rotation_deg": record["rotation_deg"] + step * TURN_DEG}])[0]
     direction = np.array(record["direction"])
     across = towards - (towards @ direction) * direction
     across /= np.linalg.norm(across)

@@ -12,7 +12,7 @@ import numpy as np
 from ddprt import seeds, warp
 from ddprt.axes import Float64
 from ddprt.errors import UserError
-from ddprt.lights import LIGHTS, Light, Lighting
+from ddprt.lights import LIGHTS, EnvironmentLight, Light, Lighting
 from ddprt.lights.light import unit
 from ddprt.sections import LightingsConfig
 
@@ -49,7 +49,7 @@ def draw_lightings(
       clearance: free radius about positions.
       seed: of the run.
     Raises:
-      UserError: no free position was found.
+      UserError: no free position was found, or there is no such image of a sky.
     """
     lightings, rejected, candidates = [], 0, 0
     for index in range(count):
@@ -67,6 +67,12 @@ def _draw_light(
     config: LightingsConfig, bounds: np.ndarray, clearance: Clearance, rng: np.random.Generator
 ) -> tuple[Light, int, int]:
     kind = config.kinds[rng.integers(len(config.kinds))]
+    if kind == "environment":
+        from ddprt.lights.panorama import stamp  # a missing image is told before anything is baked, but not yet read
+
+        stamp(config.environment)
+        scale, turn = float(np.exp(rng.uniform(*np.log(config.intensity)))), float(rng.uniform(0, 360))
+        return EnvironmentLight(image=config.environment, rotation_deg=turn, scale=scale), 0, 0
     radius = float(np.linalg.norm(bounds[1] - bounds[0]) / 2)
     size = config.size * radius
     if kind == "directional" or config.distribution == "around":

@@ -20,6 +20,7 @@ from ddprt.errors import UserError
 from ddprt.lights.light import unit
 from ddprt.scene.atlas import SHUT, Atlas
 from ddprt.scene.checks import FARTHEST
+from ddprt.scene.holes import Holes
 from ddprt.scene.mesh import Scene
 
 _DENSITY = 5  # candidates per sample kept, as the paper advises
@@ -91,10 +92,11 @@ def place_samples(scene: Scene, count: int, *, on: str, seed: int, atlas: Atlas 
     triangle = np.minimum(np.searchsorted(np.cumsum(areas), strata, side="right"), len(areas) - 1)
     weights = warp.sample_triangle(rng.random((candidates, 2)))
     weights = np.stack([1 - weights.sum(1), weights[:, 0], weights[:, 1]], 1)
-    if within:
-        is_open = _in_the_open(within, triangle, weights)
+    if on == "surface":
+        is_open = _in_the_open(scene, within, triangle, weights)
         if not is_open.all():
-            triangle, weights, area = triangle[is_open], weights[is_open], float(within.area.sum())
+            area = float(within.area.sum()) if within else area * float(is_open.mean())
+            triangle, weights = triangle[is_open], weights[is_open]
         if len(triangle) < count:
             raise UserError(
                 f'points.count: got {count} samples to place, but {len(triangle)} of {candidates} candidates on "{scene.name}" '
@@ -111,8 +113,14 @@ def place_samples(scene: Scene, count: int, *, on: str, seed: int, atlas: Atlas 
     return Samples(position, normals[triangle], albedo, float(np.sqrt(area / count)))
 
 
-def _in_the_open(atlas: Atlas, triangle: Int[np.ndarray, " n"], weights: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Which places on a scene its atlas of the open does not leave out, to a small square of a texel."""
+def _in_the_open(
+    scene: Scene, atlas: Atlas | None, triangle: Int[np.ndarray, " n"], weights: Float64[np.ndarray, "n 3"]
+) -> Bool[np.ndarray, " n"]:
+    """Which places on a scene are no holes, and not left out by its atlas of the open, to a small square of a texel."""
+    holes = Holes.of(scene)
+    there = np.ones(len(triangle), bool) if holes is None else ~holes.open_at(triangle, *weights[:, 1:].T.copy())
+    if atlas is None:
+        return there
     place = np.einsum("nc,ncd->nd", weights, atlas.uv[triangle]) * atlas.resolution
     column, row = np.clip(place.astype(int), 0, atlas.resolution - 1).T
     slot = atlas.slot[row, column]
@@ -123,7 +131,7 @@ def _in_the_open(atlas: Atlas, triangle: Int[np.ndarray, " n"], weights: Float64
     across, down = np.clip((place[parted] - np.stack([column, row], 1)[parted]) * squares, 0, squares - 1).astype(int).T
     is_open = slot != SHUT  # nothing is known of what rounding moves off its chart
     is_open[parted] = atlas.part[of_texel[slot[parted]], down, across] >= 0
-    return is_open
+    return is_open & there
 
 
 def load_samples(path: str | Path) -> Samples:

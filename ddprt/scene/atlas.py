@@ -8,6 +8,7 @@ import numpy as np
 from ddprt.axes import Bool, Float, Float32, Float64, Int, Int32
 from ddprt.compiled import compiled
 from ddprt.errors import UserError
+from ddprt.scene.filtered import mean_albedo
 from ddprt.scene.mesh import Scene
 from ddprt.scene.raster import interpolate, rasterise
 from ddprt.scene.unwrap import unwrap
@@ -278,7 +279,7 @@ def build_atlas(scene: Scene, resolution: int = 256, padding: int = 2) -> Atlas:
     reflected = np.zeros((3, len(texel)))
     for start in range(0, len(area), _BLOCK):
         part = slice(start, start + _BLOCK)
-        albedo = scene.albedo_at(pieces.triangle[part], pieces.barycentric[part].mean(1))
+        albedo = mean_albedo(scene, pieces.triangle[part], pieces.barycentric[part])
         for channel in range(3):
             np.add.at(reflected[channel], of_piece[part], area[part] * albedo[:, channel])
     total = np.bincount(of_piece, area)
@@ -338,7 +339,9 @@ def restricted(
     weights = weights_at(scene.corners[face] - scene.centre, middle)
     home, place = face[chosen], weights[chosen][:, None]
     normal = interpolate(place, home, scene.normals[scene.triangles])[:, 0]
-    reflected = size[:, None] * scene.albedo_at(face, weights)
+    home_corners = np.repeat(scene.corners[face] - scene.centre, 3, axis=0)
+    shape = weights_at(home_corners, corners[mine].reshape(-1, 3).astype(np.float64))
+    reflected = size[:, None] * mean_albedo(scene, face, shape.reshape(-1, 3, 3))
     edges = (atlas.uv[:, 1:] - atlas.uv[:, :1]) * atlas.resolution
     density = np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]) / (2 * scene.areas)
     values = {

@@ -1,7 +1,9 @@
-"""glTF 2.0 in (.glb, .gltf): triangles, base colours and base textures; all else is named once and ignored.
+"""glTF 2.0 in (.glb, .gltf): triangles and materials; what is not read is named once and ignored.
 
-Base colour factors are linear and base textures sRGB, as the standard says, and their product is taken as diffuse albedo,
-whatever the metalness. A primitive without normals is flat.
+Base colour factors are linear and base textures sRGB, as the standard says, and their product is the albedo. Emission counts
+as W/(m² sr). Blended surfaces are taken as cut out where their opacity is below a half. All textures of a material are looked
+up at one place, the first one's: of another that has texture coordinates of its own the mean is taken, and said so. A
+primitive without normals is flat.
 """
 
 import warnings
@@ -16,8 +18,8 @@ from scipy.spatial.transform import Rotation
 from ddprt.axes import Float, Float64, Int
 from ddprt.scene.accessors import Container, open_gltf
 from ddprt.scene.checks import UNSAID, checked
-from ddprt.scene.images import linear_image
-from ddprt.scene.material import Material
+from ddprt.scene.images import linear_image, plain_image
+from ddprt.scene.material import Cutout, Emission, Gloss, Material
 from ddprt.scene.mesh import Scene
 
 REFUSED = {
@@ -29,7 +31,8 @@ REFUSED = {
 }
 """Extensions whose absence would lose geometry or textures, and the way out."""
 
-UNDERSTOOD = ("KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp")
+_STRENGTH = "KHR_materials_emissive_strength"
+UNDERSTOOD = ("KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp", _STRENGTH)
 HARMLESS = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "KHR_animation", "KHR_node_visibility")
 """May be required by a file and are still only ignored."""
 
@@ -68,7 +71,7 @@ class _Reader:
     file: Container
     ignored: set[str] = field(default_factory=set)
     notes: list[str] = field(default_factory=list)
-    images: dict[int, np.ndarray] = field(default_factory=dict)
+    images: dict[tuple[int, Any], np.ndarray] = field(default_factory=dict)
 
     def scene(self) -> Scene:
         self._extensions()
@@ -89,7 +92,7 @@ class _Reader:
             normals=np.concatenate([part.normals for part in parts]),
             material=np.concatenate([np.full(len(part.triangles), numbers.index(part.material)) for part in parts]),
             materials=materials,
-            uv=np.concatenate([part.uv for part in parts]) if any(entry.texture is not None for entry in materials) else None,
+            uv=np.concatenate([part.uv for part in parts]) if any(entry.textures for entry in materials) else None,
             notes=(*self.notes, *listed),
         )
 
@@ -174,22 +177,17 @@ class _Reader:
         )
 
     def _coordinates(self, primitive: Any, count: int) -> Float[np.ndarray, "vertices 2"]:
-        texture = (
-            None if primitive.material is None else _base(self.file.entry("materials", primitive.material)).baseColorTexture
-        )
+        texture = None if primitive.material is None else _leading(self.file.entry("materials", primitive.material))
         if texture is None:
             return np.zeros((count, 2))
-        change = (texture.extensions or {}).get("KHR_texture_transform", {})
-        name = f"TEXCOORD_{change.get('texCoord', texture.texCoord or 0)}"
+        number, angle, scale, offset = _placing(texture)
+        name = f"TEXCOORD_{number}"
         accessor = getattr(primitive.attributes, name, None)
         if accessor is None:
-            raise self.file.fault(
-                f"got a base texture but no {name}, expected texture coordinates; unwrap it or drop the texture"
-            )
-        angle = change.get("rotation", 0.0)
+            raise self.file.fault(f"got a texture but no {name}, expected texture coordinates; unwrap it or drop the texture")
         # As every viewer does; the listing in the extension's text has the sign the other way round (glTF issue 1563).
         turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-        return self.file.accessor(accessor, 2) * change.get("scale", [1.0, 1.0]) @ turn.T + change.get("offset", [0.0, 0.0])
+        return self.file.accessor(accessor, 2) * scale @ turn.T + offset
 
     def _material(self, number: int) -> Material:
         if number < 0:
@@ -197,23 +195,68 @@ class _Reader:
             return Material("none", (UNSAID,) * 3)
         entry = self.file.entry("materials", number)
         base = _base(entry)
+        name = entry.name or f"material {number}"
         self.ignored.update(
-            what
-            for what, there in (
-                ("emissive", any(entry.emissiveFactor or []) or entry.emissiveTexture),
-                ("alpha", (entry.alphaMode or "OPAQUE") != "OPAQUE"),
-                ("double-sided (back faces absorb)", entry.doubleSided),
-                ("metallic and roughness", base.metallicFactor or base.metallicRoughnessTexture),
-                ("normal maps", entry.normalTexture),
-                ("occlusion maps", entry.occlusionTexture),
-            )
-            if there
+            what for what, there in (("normal maps", entry.normalTexture), ("occlusion maps", entry.occlusionTexture)) if there
         )
-        red, green, blue = (float(value) for value in (base.baseColorFactor or [1.0] * 4)[:3])
-        texture = None if base.baseColorTexture is None else self._image(base.baseColorTexture.index)
-        return Material(entry.name or f"material {number}", (red, green, blue), texture)
+        red, green, blue, alpha = (float(value) for value in base.baseColorFactor or [1.0] * 4)
+        texture = None if base.baseColorTexture is None else self._image(base.baseColorTexture.index, linear_image)
+        return Material(
+            name,
+            (red, green, blue),
+            texture,
+            bool(entry.doubleSided),
+            self._cutout(entry, name, alpha),
+            self._emission(entry, name),
+            self._gloss(entry, name),
+        )
 
-    def _image(self, number: int) -> np.ndarray:
+    def _cutout(self, entry: Any, name: str, alpha: float) -> Cutout | None:
+        """Its holes; None where it has none."""
+        mode, texture = entry.alphaMode or "OPAQUE", _base(entry).baseColorTexture
+        if mode == "OPAQUE":
+            return None
+        if mode == "BLEND":
+            self.notes.append(f'material "{name}": blending is not simulated; taken as cut out where its opacity is below 0.5')
+        cutoff = 0.5 if mode == "BLEND" or entry.alphaCutoff is None else float(entry.alphaCutoff)
+        opacity = np.ones((1, 1), np.float32) if texture is None else self._image(texture.index, plain_image)[..., 3]
+        opacity = opacity * np.float32(alpha)
+        if cutoff > 1:  # as the standard says, nothing is that opaque
+            opacity, cutoff = np.zeros((1, 1), np.float32), 1.0
+        return Cutout(np.ascontiguousarray(opacity), cutoff) if opacity.min() < cutoff else None
+
+    def _emission(self, entry: Any, name: str) -> Emission | None:
+        strength = (entry.extensions or {}).get(_STRENGTH, {}).get("emissiveStrength", 1.0)
+        colour = np.array(entry.emissiveFactor or [0.0] * 3) * strength
+        if not colour.any():
+            return None
+        colour, texture = self._factored(entry, entry.emissiveTexture, colour, linear_image, slice(3), f'"{name}": emission')
+        red, green, blue = colour.tolist()
+        return Emission((red, green, blue), texture)
+
+    def _gloss(self, entry: Any, name: str) -> Gloss:
+        base = _base(entry)
+        factors = np.array([1.0 if factor is None else factor for factor in (base.roughnessFactor, base.metallicFactor)])
+        channels = slice(1, 3)  # green is roughness, blue metalness
+        of = f'"{name}": metallic and roughness'
+        factors, texture = self._factored(entry, base.metallicRoughnessTexture, factors, plain_image, channels, of)
+        roughness, metallic = factors.tolist()
+        return Gloss(roughness, metallic, texture=texture)
+
+    def _factored(
+        self, entry: Any, texture: Any, factor: np.ndarray, kind: Any, channels: slice, of: str
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """A factor and its image, or the image's mean in the factor where that lies elsewhere than the first texture."""
+        if texture is None:
+            return factor, None
+        image = np.ascontiguousarray(self._image(texture.index, kind)[..., channels])
+        if _placing(texture) == _placing(_leading(entry)):
+            return factor, image
+        self.notes.append(f"material {of} texture has texture coordinates of its own: its mean is taken")
+        return factor * image.mean((0, 1), dtype=np.float64), None
+
+    def _image(self, number: int, kind: Any) -> np.ndarray:
+        """An image of the file, decoded in one of two ways."""
         texture = self.file.entry("textures", number)
         webp = (texture.extensions or {}).get("EXT_texture_webp", {}).get("source")
         source = webp if webp is not None else texture.source
@@ -223,20 +266,33 @@ class _Reader:
             sampler = self.file.entry("samplers", texture.sampler)
             if {sampler.wrapS, sampler.wrapT} - {None, 10497}:
                 self.ignored.add("texture wrap modes other than repeat")
-        if source in self.images:
-            return self.images[source]
+        if (source, kind) in self.images:
+            return self.images[source, kind]
         image = self.file.entry("images", source)
         try:
-            self.images[source] = linear_image(
-                bytes(self.file.view(image.bufferView)) if image.uri is None else self.file.uri(image.uri)
-            )
+            data = bytes(self.file.view(image.bufferView)) if image.uri is None else self.file.uri(image.uri)
+            self.images[source, kind] = kind(data)
         except OSError as problem:
             raise self.file.fault(f"got image {source} that cannot be read ({problem}); export textures as PNG") from problem
-        return self.images[source]
+        return self.images[source, kind]
 
 
 def _base(material: Any) -> Any:
-    return material.pbrMetallicRoughness or pygltflib.PbrMetallicRoughness(metallicFactor=0.0)
+    return material.pbrMetallicRoughness or pygltflib.PbrMetallicRoughness()
+
+
+def _leading(material: Any) -> Any:
+    """The texture whose coordinates a material's others are looked up by; None where it has none."""
+    base = _base(material)
+    textures = (base.baseColorTexture, base.metallicRoughnessTexture, material.emissiveTexture)
+    return next((texture for texture in textures if texture is not None), None)
+
+
+def _placing(texture: Any) -> tuple[int, float, list[float], list[float]]:
+    """Number of its texture coordinates, and how they are turned, scaled and moved."""
+    change = (texture.extensions or {}).get("KHR_texture_transform", {})
+    number = change.get("texCoord", texture.texCoord or 0)
+    return number, change.get("rotation", 0.0), change.get("scale", [1.0, 1.0]), change.get("offset", [0.0, 0.0])
 
 
 def _transform(node: Any) -> Float64[np.ndarray, "4 4"]:

@@ -23,10 +23,23 @@ def linear_image(source: bytes | Image.Image) -> Float32[np.ndarray, "height wid
     Raises:
       OSError: Pillow cannot decode it.
     """
-    image = Image.open(io.BytesIO(source)) if isinstance(source, bytes) else source
+    image = _opened(source)
     if image.mode.startswith("I"):
         # Pillow would clip 16-bit grey at 255 when it converts.
         grey = srgb_to_linear(np.clip(np.asarray(image) / 65535.0, 0.0, 1.0))
         return np.repeat(grey[..., None], 3, axis=2).astype(np.float32)
     curve = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
     return curve[np.asarray(image.convert("RGB"))]
+
+
+def plain_image(source: bytes | Image.Image) -> Float32[np.ndarray, "height width 4"]:
+    """Decode a picture whose numbers are no colours: as stored, 0 to 1, row 0 at the top; alpha 1 where it has none.
+
+    Raises:
+      OSError: Pillow cannot decode it.
+    """
+    return np.asarray(_opened(source).convert("RGBA")) / np.float32(255)
+
+
+def _opened(source: bytes | Image.Image) -> Image.Image:
+    return Image.open(io.BytesIO(source)) if isinstance(source, bytes) else source

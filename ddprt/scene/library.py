@@ -11,7 +11,7 @@ from ddprt.errors import UserError, nearest
 from ddprt.scene.checks import checked, vertex_normals
 from ddprt.scene.cornell import cornell, cornell_hole
 from ddprt.scene.lion import lion
-from ddprt.scene.material import Material
+from ddprt.scene.material import Cutout, Emission, Material
 from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import box, faceted, hollow, icosphere, rectangle
 
@@ -153,12 +153,95 @@ def faults(*, albedo: float = 0.7, thickness: float = 0.003, gap: float = 0.004)
     return faceted("faults", np.concatenate(quads), (Material("grey", (albedo,) * 3),))
 
 
+def neon(*, radiance: float = 40.0, albedo: float = 0.7) -> Scene:
+    """A small room with a glowing sign: LIT in bars before the back wall, two letters pink and one blue, and a table.
+
+    The sign lights the room whatever lamps there are besides, from surfaces that are narrow and near a wall.
+
+    Args:
+      radiance: of the brighter letters' strongest channel, W/(m² sr).
+      albedo: of walls, floor and ceiling.
+    """
+    room = hollow(np.ones((1, 1, 1), bool), np.array([-1.5, 1.5]), np.array([0.0, 2.4]), np.array([0.0, 3.0]))
+    bars = [
+        (-0.65, 1.2, -0.6, 1.9),
+        (-0.59, 1.2, -0.3, 1.25),
+        (-0.05, 1.2, 0.0, 1.9),
+        (0.3, 1.85, 0.7, 1.9),
+        (0.475, 1.2, 0.525, 1.84),
+    ]
+    sign = [box(np.array([left, low, 0.05]), np.array([right, high, 0.1])) for left, low, right, high in bars]
+    table = box(np.array([-0.7, 0.68, 1.1]), np.array([0.7, 0.75, 1.8]))
+    paint = np.repeat([0, 1, 2, 1, 3], [6, 12, 6, 12, 6])
+    glass, grey = (0.1,) * 3, (albedo,) * 3
+    tubes = [
+        Material(f"{name} tube", glass, emission=Emission((radiance * red, radiance * green, radiance * blue)))
+        for name, (red, green, blue) in (("pink", (1.0, 0.12, 0.35)), ("blue", (0.08, 0.4, 0.9)))
+    ]
+    return faceted(
+        "neon",
+        np.concatenate([room, *sign, table]),
+        (Material("plaster", grey), *tubes, Material("wood", (0.5, 0.3, 0.15))),
+        paint,
+    )
+
+
 def _turned(centre: tuple[float, float, float], size: tuple[float, float, float], degrees: float) -> np.ndarray:
     """A closed box seen from outside, turned about the vertical."""
     half, angle = np.array(size) / 2, math.radians(degrees)
     cosine, sine = math.cos(angle), math.sin(angle)
     turn = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
     return np.round(box(-half, half) @ turn.T + centre, 9)  # sines differ in their last bit from machine to machine
+
+
+def leaves(*, albedo: float = 0.6, cards: int = 5) -> Scene:
+    """A closed room of 2 m with cards that leaves are cut out of: light passes between them, and both their sides reflect.
+
+    Args:
+      albedo: of the walls.
+      cards: how many, side by side at several heights; 12 at most.
+    Raises:
+      UserError: more cards than there is room for.
+    """
+    if cards > 12:
+        raise UserError(f"leaves.cards: got {cards}, expected 12 at most; take away some")
+    room = hollow(np.ones((1, 1, 1), bool), *(np.array([0.0, 2.0]),) * 3)
+    quads, spots = [*room], [(0.55, 0.8, 0.5), (1.4, 1.1, 0.6), (1.0, 0.6, 1.1), (0.5, 1.3, 1.4), (1.5, 0.75, 1.5)]
+    spots += [(0.3 + 0.45 * (k % 4), 1.65, 0.4 + 0.6 * (k // 4)) for k in range(7)]
+    for index, spot in enumerate(spots[:cards]):
+        turn, tilt = 1.1 * index, 0.35 + 0.25 * (index % 3)
+        along = np.array([math.cos(turn), 0.0, math.sin(turn)])
+        across = np.array([-math.sin(turn) * math.cos(tilt), math.sin(tilt), math.cos(turn) * math.cos(tilt)])
+        size = 0.42 if index < 5 else 0.18
+        quads.append(np.array(spot) + size * np.array([-along - across, along - across, along + across, across - along]))
+    positions = np.round(np.concatenate(quads), 9)  # sines differ in their last bit from machine to machine
+    triangles = (4 * np.arange(len(quads))[:, None, None] + [[0, 1, 2], [0, 2, 3]]).reshape(-1, 3)
+    return checked(
+        "leaves",
+        positions,
+        triangles,
+        normals=vertex_normals(positions, triangles),
+        material=np.repeat([0, 1], [2 * len(room), 2 * cards]),
+        materials=(
+            Material("wall", (albedo,) * 3),
+            Material("leaf", (0.25, 0.5, 0.12), two_sided=True, cutout=Cutout(_foliage(96))),
+        ),
+        uv=np.tile([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]], (len(quads), 1)),
+    )
+
+
+def _foliage(size: int) -> np.ndarray:
+    """Opacity of a twig with six leaves, its rims soft over two pixels."""
+    y, x = (np.mgrid[:size, :size] + 0.5) / size
+    inside = 0.012 - np.abs(x - 0.5) + 0 * y  # the twig: how far inside a point lies
+    for index in range(6):
+        side = 1 if index % 2 else -1
+        angle, reach = side * (0.75 + 0.1 * index), 0.21
+        middle_x, middle_y = 0.5 + side * reach * math.sin(0.95), 0.8 - 0.12 * index
+        along = (x - middle_x) * math.sin(angle) - (y - middle_y) * math.cos(angle)
+        across = (x - middle_x) * math.cos(angle) + (y - middle_y) * math.sin(angle)
+        inside = np.maximum(inside, 0.085 * (1 - (along / reach) ** 2) - np.abs(across))
+    return np.clip(0.5 + 0.5 * size * inside, 0, 1).round(4).astype(np.float32)
 
 
 SCENES: Catalogue[Callable[..., Scene]] = Catalogue(
@@ -172,6 +255,8 @@ SCENES: Catalogue[Callable[..., Scene]] = Catalogue(
         "statue": statue,
         "convex": convex,
         "faults": faults,
+        "leaves": leaves,
+        "neon": neon,
         "lion": lion,
     },
 )

@@ -29,6 +29,7 @@ class Scene:
       notes: what the checks repaired, one line each.
       whole: the scene that this one is, when a user has left effects out of it; see `ddprt.transport.effects.force`.
       forced: effects that a user wants simulated whatever the materials say.
+      refused: effects that a user has left out.
     """
 
     name: str
@@ -41,6 +42,7 @@ class Scene:
     notes: tuple[str, ...] = ()
     whole: "Scene | None" = None
     forced: tuple[str, ...] = ()
+    refused: tuple[str, ...] = ()
 
     @cached_property
     def corners(self) -> Float64[np.ndarray, "triangles 3 3"]:

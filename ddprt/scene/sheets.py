@@ -5,10 +5,14 @@ are cut alike they share their corners (see `checks`); where they are cut differ
 sorted by their plane, then into strips and along these, and only those whose boxes meet are cut against each other.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from ddprt.axes import Bool, Float64
 from ddprt.compiled import compiled
+from ddprt.scene.mesh import Scene
+from ddprt.scene.winding import repeats, welded
 
 _CELL = 1 / 32
 """Side of a cell of planes, as a share of the radius. Feet of one plane differ by at most 5 radii times the error of their
@@ -17,6 +21,31 @@ a cell where both are higher than 1/7000 of the radius."""
 
 _GRIDS = 4  # one more than there are axes: each axis parts two points nearer than a cell / 4 in at most one of them
 _FACING = -0.9  # greatest cosine between normals that counts as opposite: slivers are turned by rounding
+
+
+def backs(scene: Scene) -> Bool[np.ndarray, " triangles"]:
+    """Triangles that `checked` has given to open surfaces of two-sided materials as their backs.
+
+    They share their three places with an earlier triangle, which nothing else in a checked scene does.
+    """
+    return repeats(welded(scene.positions)[scene.triangles], np.ones(len(scene.triangles), bool))[0]
+
+
+def without_backs(scene: Scene) -> Scene:
+    """The scene with one-sided materials alone: backs are no surfaces of their own, they block light and absorb it."""
+    kept = ~backs(scene)
+    scene = scene.made_of(lambda material: replace(material, two_sided=False) if material.two_sided else material)
+    if kept.all():
+        return scene
+    used, triangles = np.unique(scene.triangles[kept], return_inverse=True)
+    return replace(
+        scene,
+        positions=scene.positions[used],
+        triangles=triangles.reshape(-1, 3).astype(np.int32),
+        normals=scene.normals[used],
+        material=scene.material[kept],
+        uv=None if scene.uv is None else scene.uv[used],
+    )
 
 
 def back_to_back(corners: Float64[np.ndarray, "triangles 3 3"], tolerance: float) -> Bool[np.ndarray, " triangles"]:

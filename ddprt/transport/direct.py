@@ -7,6 +7,7 @@ reach, then their shadow rays, then what is left of its light. All but the shado
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 
 import numpy as np
 
@@ -142,7 +143,9 @@ def mean_irradiance(
     total = np.zeros((places.count, 3), np.float32)
     for light in lighting:
         words = rng.integers(0, 1 << 64, 0 if light.delta else places.count, np.uint64).view(np.uint32).reshape(-1, 2)
-        _add(tracer, light, places, partial(_shifted, words, _sequence(places.samples)), total, shadows)
+        around = light.anchor() is None and not light.delta
+        sequence = (_lattice if around else _sequence)(places.samples)
+        _add(tracer, light, places, partial(_shifted, words, sequence), total, shadows)
     return total
 
 
@@ -189,12 +192,16 @@ def _add(
     for index, block in enumerate(places.blocks):
         if not light.delta:
             numbers(index * size, u)
-        sample = light.illuminate(block[:3].T, u.T, sample)
+        sample = light.illuminate(block[:3].T, u.T, sample, block[3:].T)
         light_there = sample.direction.T, sample.distance, sample.strength
         rays = _aim(block, *light_there, tracer.offset, weight, target, origins, directions, reach)
         if rays and any(sample.colour):
             seen = tracer.unoccluded(origins[:rays], directions[:rays], reach[:rays]) if shadows else np.ones(rays, np.int32)
-            _collect(seen, target, weight, sample.colour / samples, samples, index * size // samples, total)
+            arriving = seen, target, weight, sample.colour / samples, samples, index * size // samples, total
+            if sample.tint is None:
+                _collect(*arriving)
+            else:
+                import_module("ddprt.transport.tinted").into_groups(sample.tint.T, *arriving)
 
 
 def _given(numbers: Float32[np.ndarray, "n 2"], first: int, u: Float32[np.ndarray, "2 points"]) -> None:
@@ -208,6 +215,15 @@ def _sequence(samples: int) -> Float32[np.ndarray, "2 samples"]:
     """
     rho = 1.32471795724474602596
     return np.minimum(np.arange(samples) / np.array([[rho], [rho**2]]) % 1, 1 - 2**-24).astype(np.float32)
+
+
+def _lattice(samples: int) -> Float32[np.ndarray, "2 samples"]:
+    """The same for light from all around, of which every sample counts: even steps, and turns by the golden ratio.
+
+    Even steps put as many samples of each group below a half as above it, where a sky divides its techniques.
+    """
+    steps = np.arange(samples)
+    return np.stack([steps / samples, np.minimum(steps * 0.61803398874989485 % 1, 1 - 2**-24)]).astype(np.float32)
 
 
 @compiled

@@ -17,8 +17,10 @@ from ddprt.config import Config
 from ddprt.errors import UserError
 from ddprt.lights import LIGHTS, Lighting, parse_lighting
 from ddprt.scene.files import load_scene
+from ddprt.scene.holes import pierced
 from ddprt.scene.material import Material
 from ddprt.scene.mesh import Scene
+from ddprt.scene.sheets import backs, without_backs
 
 _FLAT = 1e-6  # of the radius: how far a corner may stand before a triangle's plane and still be in it
 _CHUNK = 1 << 22
@@ -71,11 +73,13 @@ class Question:
     Attributes:
       scene, lightings: of the bake.
       bounces: asked for; -1 lets the scene decide.
+      probes: which are asked for, in words; empty for none.
     """
 
     scene: Scene
     lightings: Sequence[Lighting]
     bounces: int = -1
+    probes: str = ""
 
     def users(self, has: Callable[[Material], object]) -> str:
         """The materials in use that have something, in words; empty where none has."""
@@ -100,16 +104,18 @@ class Entry:
     left: Callable[[Question], float | None] = lambda question: None
 
 
-def plan(scene: Scene, lightings: Sequence[Lighting], *, bounces: int = -1) -> Plan:
+def plan(scene: Scene, lightings: Sequence[Lighting], *, bounces: int = -1, probes: str = "") -> Plan:
     """Decides what to simulate.
 
     Args:
       scene: its materials and shape; from `force` where the user decides.
       lightings: all that will be baked.
       bounces: -1 lets the scene decide; 0 and up is forced.
+      probes: which are asked for, in words (`config.probes.asked`); empty for none.
     """
     parsed = [parse_lighting(lighting, f"lighting {index}") for index, lighting in enumerate(lightings)]
-    effects = tuple(_decided(name, entry, Question(scene, parsed, bounces)) for name, entry in EFFECTS.items())
+    question = Question(scene, parsed, bounces, probes)
+    effects = tuple(_decided(name, entry, question) for name, entry in EFFECTS.items())
     return Plan(effects, bounces if effects[0].called else 0)
 
 
@@ -133,7 +139,9 @@ def force(scene: Scene, *, on: Sequence[str] = (), off: Sequence[str] = ()) -> S
     for name in off:
         without = EFFECTS[name].without
         left = without(left) if without else left
-    return replace(left, whole=whole if left is not whole else None, forced=tuple(sorted({*scene.forced, *on})))
+    forced, refused = ({*said} - {*other} for said, other in (((*scene.forced, *on), off), ((*scene.refused, *off), on)))
+    cut = whole if left is not whole else None
+    return replace(left, whole=cut, forced=tuple(sorted(forced)), refused=tuple(sorted(refused)))
 
 
 def configured_scene(config: Config) -> Scene:
@@ -143,6 +151,8 @@ def configured_scene(config: Config) -> Scene:
 
 def _decided(name: str, entry: Entry, question: Question) -> Effect:
     effect, whole = entry.decide(name, question), question.scene.whole
+    if effect.called and name in question.scene.refused:  # by the settings: there was nothing to take out of the scene
+        return Effect(name, False, f"forced off, though it is called for: {effect.why}", entry.left(question), True)
     if effect.called:
         return effect
     if name in question.scene.forced:
@@ -191,9 +201,56 @@ def _material(has: Callable[[Material], object], lacking: str) -> Callable[[str,
     return decide
 
 
+def _without_cutouts(scene: Scene) -> Scene:
+    return scene.made_of(lambda material: replace(material, cutout=None) if material.cutout else material)
+
+
+def _two_sided(name: str, question: Question) -> Effect:
+    users = question.users(lambda material: material.two_sided)
+    count = int(np.count_nonzero(backs(question.scene))) if users else 0
+    why = f"{users}: {count} triangles have a back of their own" if count else "no open surface has two sides"
+    return Effect(name, count > 0, why)
+
+
+def _emission(name: str, question: Question) -> Effect:
+    users, used = question.users(_brightest), question.scene.used_materials
+    if not users:
+        return Effect(name, False, "no material emits light")
+    brightest, albedo = max(map(_brightest, used)), max(max(material.albedo) for material in used)
+    bound = f"at most {np.pi * brightest / (1 - albedo):.3g}" if albedo < 1 else "any amount of"
+    return Effect(name, True, f"{users}, {bound} W/m² of irradiance")
+
+
+def _brightest(material: Material) -> float:
+    """Largest radiance that it emits."""
+    part = material.emission
+    return 0.0 if part is None else max(part.radiance) * (1.0 if part.texture is None else float(part.texture.max()))
+
+
+def _without_emission(scene: Scene) -> Scene:
+    return scene.made_of(lambda material: replace(material, emission=None))
+
+
+def _probes(name: str, question: Question) -> Effect:
+    asked = question.probes
+    return Effect(name, bool(asked), f"the configuration asks for {asked}" if asked else "the configuration asks for none")
+
+
+def probed(config: Config, scene: Scene) -> bool:
+    """Whether a bake has probes, without the rest of its plan."""
+    return _decided("probes", EFFECTS["probes"], Question(scene, (), probes=config.probes.asked)).called
+
+
 EFFECTS: Catalogue[Entry] = Catalogue(
     "effect",
-    {"diffuse bounces": Entry(_diffuse_bounces), **{f"{kind} lights": _light_kind(kind) for kind in LIGHTS}},
+    {
+        "diffuse bounces": Entry(_diffuse_bounces),
+        **{f"{kind} lights": _light_kind(kind) for kind in LIGHTS},
+        "cut-outs": Entry(_material(pierced, "no material has holes"), "cutouts", _without_cutouts),
+        "two-sided sheets": Entry(_two_sided, without=without_backs),
+        "emission": Entry(_emission, "emission", _without_emission),
+        "probes": Entry(_probes, "probes", lambda scene: scene, lambda question: 0.0),  # no lightmap has light from them
+    },
 )
 
 

@@ -19,6 +19,7 @@ from ddprt import warp
 from ddprt.axes import Bool, Float32, Float64, Int32
 from ddprt.errors import UserError
 from ddprt.scene.distance import distance_within
+from ddprt.scene.holes import Holes
 from ddprt.scene.mesh import Scene
 from ddprt.scene.sheets import back_to_back
 
@@ -50,22 +51,51 @@ class Hits:
     distance: Float32[np.ndarray, " rays"]
 
 
+class Geometry:
+    """Triangles that Embree knows.
+
+    Args:
+      corners: metres.
+    Raises:
+      UserError: embreex is missing (there is no slow fallback).
+    """
+
+    def __init__(self, corners: Float32[np.ndarray, "triangles 3 3"]) -> None:
+        try:
+            from embreex.mesh_construction import TriangleMesh
+            from embreex.rtcore_scene import EmbreeScene
+        except ImportError as error:
+            raise UserError(f"embreex: got {error}, expected the ray tracer; pip install embreex") from None
+        self._embree = EmbreeScene()
+        index = np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)
+        self._mesh = TriangleMesh(self._embree, corners.reshape(-1, 3), index)
+        # The first run commits the scene; it must not happen in two threads at once.
+        self._embree.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+
+    def first(
+        self, origins: np.ndarray, directions: np.ndarray, reach: Float32[np.ndarray, " rays"] | None = None
+    ) -> tuple[np.ndarray, ...]:
+        """See `Tracer.first`; nothing further than `reach` metres counts, which Embree overwrites."""
+        found = self._embree.run(origins, directions, dists=reach, query="INTERSECT", output=True)
+        return found["primID"], found["u"], found["v"], found["tfar"]
+
+    def unoccluded(self, origins: np.ndarray, directions: np.ndarray, reach: np.ndarray) -> Int32[np.ndarray, " rays"]:
+        """See `Tracer.unoccluded`."""
+        return self._embree.run(origins, directions, dists=reach, query="OCCLUDED")
+
+
 class Tracer:
     """A scene that rays can be shot at.
 
     Args:
       corners: triangle corners, world space, metres.
       threads: workers of `map`; 0 takes one per core.
+      holes: where rays pass through triangles, if anywhere.
     Raises:
       UserError: embreex is missing (there is no slow fallback).
     """
 
-    def __init__(self, corners: Float64[np.ndarray, "triangles 3 3"], threads: int = 0) -> None:
-        try:
-            from embreex.mesh_construction import TriangleMesh
-            from embreex.rtcore_scene import EmbreeScene
-        except ImportError as error:
-            raise UserError(f"embreex: got {error}, expected the ray tracer; pip install embreex") from None
+    def __init__(self, corners: Float64[np.ndarray, "triangles 3 3"], threads: int = 0, holes: Holes | None = None) -> None:
         self._world, self._boxes = corners, np.stack([corners.min(1), corners.max(1)], 1)
         low, high = self._boxes[:, 0].min(0), self._boxes[:, 1].max(0)
         self.centre = (low + high) / 2
@@ -82,17 +112,16 @@ class Tracer:
         # Each side of a sheet forward by half: receivers, lifted by the whole, stay before their own. Only Embree knows.
         traced, sheets = local.copy(), back_to_back(local.astype(np.float64), float(self.offset) / 2)
         traced[sheets] += self.offset / 2 * self.normals[sheets, None]
-        self._embree = EmbreeScene()
-        self._mesh = TriangleMesh(
-            self._embree, traced.reshape(-1, 3), np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)
-        )
-        # The first run commits the scene; it must not happen in two threads at once.
-        self._embree.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+        self._geometry, self.openwork = Geometry(traced), None
+        if holes is not None:
+            from ddprt.transport.cutouts import Openwork
+
+            self.openwork = Openwork(holes, traced, self.offset, self._count)
 
     @classmethod
     def of(cls, scene: Scene, threads: int = 0) -> "Tracer":
         """The tracer of a scene."""
-        return cls(scene.corners, threads)
+        return cls(scene.corners, threads, Holes.of(scene))
 
     def closest(self, origins: Float32[np.ndarray, "rays 3"], directions: Float32[np.ndarray, "rays 3"]) -> Hits:
         """First surface along each ray (centred frame, unit directions)."""
@@ -106,8 +135,8 @@ class Tracer:
     ) -> tuple[np.ndarray, ...]:
         """Triangle (-1: none), u, v and distance of the first hit of each ray, as Embree gives them; contiguous arrays."""
         self._count(len(origins))
-        found = self._embree.run(origins, directions, query="INTERSECT", output=True)
-        return found["primID"], found["u"], found["v"], found["tfar"]
+        found = self._geometry.first(origins, directions)
+        return self.openwork.first(origins, directions, found) if self.openwork else found
 
     def unoccluded(
         self,
@@ -116,8 +145,10 @@ class Tracer:
         reach: Float32[np.ndarray, " rays"],
     ) -> Int32[np.ndarray, " rays"]:
         """Not 0 where nothing lies within `reach` metres of an origin; contiguous arrays. Embree overwrites `reach`."""
+        if self.openwork:
+            return self.openwork.unoccluded(origins, directions, reach)
         self._count(len(origins))
-        return self._embree.run(origins, directions, dists=reach, query="OCCLUDED")
+        return self._geometry.unoccluded(origins, directions, reach)
 
     def on_triangle(
         self, triangle: Int32[np.ndarray, " n"], u: Float32[np.ndarray, " n"], v: Float32[np.ndarray, " n"]

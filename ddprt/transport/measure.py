@@ -57,6 +57,9 @@ def measure(
     total = np.zeros((len(positions), 3), np.float32)
     with np.errstate(over="ignore", invalid="ignore"):  # see `mean_irradiance`
         for lamp in lights:
+            if lamp.anchor() is None and not lamp.delta:  # a sky is the same behind the surface, and its shadows have colours
+                total += light((lamp,), surface, True)
+                continue
             whole, seen = (light((_bare(lamp),), surface, shadows).max(1) for shadows in (False, True))
             visible = np.where(whole > seen, seen / np.where(whole > 0, whole, 1), seen > 0)
             sunk = 2 * light((lamp,), near, False) - light((lamp,), far, False)

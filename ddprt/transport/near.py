@@ -9,7 +9,7 @@ Reference: Christensen, "Faster Photon Map Global Illumination", 1999, goes on i
 short.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -55,6 +55,7 @@ class NearField:
       albedo: of the senders.
       reach: square of the distance within which each sender is near, m².
       endless: all bounces are followed; otherwise only the direct light is looked at.
+      shine: what tells a lighting's light at places: `mean_irradiance`, or what takes the same.
     """
 
     tracer: Tracer
@@ -64,6 +65,7 @@ class NearField:
     albedo: Float32[np.ndarray, "senders 3"]
     reach: Float32[np.ndarray, " senders"]
     endless: bool
+    shine: Callable[..., Float32[np.ndarray, "places 3"]] = mean_irradiance
 
     def some(self, chosen: Int[np.ndarray, " chosen"]) -> "NearField":
         """The same for a few of the lightings."""
@@ -110,7 +112,7 @@ class NearField:
         weight = weight[share] * np.float32(count / len(share))
         places = Places.of(self.tracer, near.position[share], near.normal[share])
         for index, lighting in enumerate(self.lightings):
-            light = mean_irradiance(self.tracer, lighting, places, rng)
+            light = self.shine(self.tracer, lighting, places, rng)
             _add_difference(near.receiver[share], near.cell[share], light, self.direct, weight, 3 * index, sums)
 
     def _onwards(

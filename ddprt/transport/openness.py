@@ -58,8 +58,11 @@ class _Split:
 
 
 def build_open_atlas(tracer: Tracer, scene: Scene, resolution: int, padding: int = 2) -> tuple[Atlas, dict[str, int]]:
-    """Unwraps a scene and keeps what is in the open; see `build_atlas` and `open_atlas`."""
-    return open_atlas(tracer, build_atlas(scene, resolution, padding), scene)
+    """Unwraps a scene and keeps what is there and in the open; see `build_atlas`, `open_atlas` and `transport.cutouts`."""
+    atlas = build_atlas(scene, resolution, padding)
+    if tracer.openwork:
+        atlas = tracer.openwork.left_of(atlas, scene)
+    return open_atlas(tracer, atlas, scene)
 
 
 def open_atlas(tracer: Tracer, atlas: Atlas, scene: Scene) -> tuple[Atlas, dict[str, int]]:

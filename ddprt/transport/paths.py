@@ -14,6 +14,7 @@ their grain, as those of the operator do.
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from itertools import pairwise
 from typing import Any
 
@@ -238,7 +239,7 @@ def _shade(
             if not light.delta:
                 np.add(numbers[:2], shift[:2, None], out=u)
                 u -= u >= 1
-            sample = light.illuminate(vertices.place[:3].T, u.T, sample)
+            sample = light.illuminate(vertices.place[:3].T, u.T, sample, vertices.place[3:].T)
             if not any(sample.colour):
                 continue
             there = sample.direction.T, sample.distance, sample.strength
@@ -246,7 +247,11 @@ def _shade(
             rays = _aim(vertices.place, *there, tracer.offset, *chance, weight, target, origins, directions, reach)
             if rays:
                 seen = tracer.unoccluded(origins[:rays], directions[:rays], reach[:rays])
-                _collect(seen, target, weight, vertices.throughput, vertices.owner, sample.colour, total)
+                arriving = seen, target, weight, vertices.throughput, vertices.owner, sample.colour, total
+                if sample.tint is None:
+                    _collect(*arriving)
+                else:
+                    import_module("ddprt.transport.tinted").into_receivers(sample.tint.T, *arriving)
 
 
 def _shift(light: Light) -> Float32[np.ndarray, "3"]:

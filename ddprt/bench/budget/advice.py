@@ -97,7 +97,7 @@ def turn(knob: Knob, budget: Budget, bakery: Bakery) -> Turned:
     fit_seconds = time.perf_counter() - start
     kept = stored(model, config.export.precision)
     engine, _ = engine_values(model, budget.lightings, config.budget)
-    error = squared_error(np.maximum(kept.predict(engine, clamp=False), 0), budget.truth, budget.weight)
+    error = squared_error(np.maximum(kept.predict(engine, clamp=False, constant=False), 0), budget.truth, budget.weight)
     size = shipped_bytes(model, config.export.precision)
     root = float(np.sqrt(max(error, 0.0))) / budget.parts.mean
     return Turned(root, size, model.relighter.flops, round(fit_seconds, 3), seconds, {"status": model.relighter.report.status})
@@ -202,7 +202,7 @@ def _against_measurement(budget: Budget, config: Config) -> Knob | None:
     fewer = best_transfer(replace(model, points=points // 2), *yard.unseen())
     values = yard.clean.values(yard.clean.split("test"), points // 2, model.quantity)
     one, other = (projected(model, budget.values, half) for half in budget.own)
-    before = squared_error(fewer.predict(values, clamp=False), (one, other), budget.weight)
+    before = squared_error(fewer.predict(values, clamp=False, constant=False), (one, other), budget.weight)
     now = budget.parts.part("measurement") * budget.parts.mean**2
     expected = _left(budget, "measurement", float(np.clip(now / before, 0.0, 1.0)) if before > 0 else 1.0)
     why = f"as from {points // 2} points to {points}"
@@ -253,7 +253,8 @@ def _left(budget: Budget, cause: str, kept: float) -> float:
 def _looked(budget: Budget, data: Dataset, config: Config) -> float:
     """Relative RMSE of the whole by a fit on clean maps: what that gains there it is expected to gain on those of the run."""
     before, after = (
-        squared_error(model.predict(budget.values, clamp=False), budget.truth, budget.weight) / budget.parts.mean**2
+        squared_error(model.predict(budget.values, clamp=False, constant=False), budget.truth, budget.weight)
+        / budget.parts.mean**2
         for model in (budget.clean, fit_config(data, config, budget.clean.method))
     )
     return float(np.sqrt(max(budget.parts.squared + after - before, 0.0)))

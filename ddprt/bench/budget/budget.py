@@ -172,7 +172,7 @@ def table(document: dict[str, Any]) -> str:
 
 def engine_values(model: Model, lightings: list[Lighting], budget: BudgetConfig) -> tuple[np.ndarray, int]:
     """(lightings, points, 3) light at a model's points by shadow maps, W/m², and the rays that drew them."""
-    tracer, samples = Tracer(model.occluders), model.samples
+    tracer, samples = Tracer(model.occluders, holes=model.holes), model.samples
     settings: dict[str, Any] = {"resolution": budget.shadow_map, "taps": budget.shadow_filter, "depth": samples.depth}
     rows = [engine_irradiance(tracer, lighting, samples.position, samples.normal, **settings) for lighting in lightings]
     return average_into_points(np.stack(rows), samples, model.points, model.quantity), tracer.rays
@@ -188,9 +188,9 @@ def _chain(
     """From what ships to what the integrator's own maps, which are left out, remove; and the model fitted on clean maps."""
     clean, config = yard.clean, bakery.config
     kept = stored(model, config.export.precision)
-    unclamped = kept.predict(engine, clamp=False)
-    exact = kept.predict(values, clamp=False)
-    fitted = exact if kept is model else model.predict(values, clamp=False)
+    unclamped = kept.predict(engine, clamp=False, constant=False)
+    exact = kept.predict(values, clamp=False, constant=False)
+    fitted = exact if kept is model else model.predict(values, clamp=False, constant=False)
     trained = yard.bounded(clean, yard.train)
     clean_model = fit_config(trained, config, model.method)
     chain = [
@@ -202,16 +202,18 @@ def _chain(
     if isinstance(model.relighter, LinearTransfer):
         last = best_transfer(model, *yard.unseen())
         there = last if yard.elsewhere is None else best_transfer(model, (clean, clean.split("train")))
-        there_light = there.predict(values, clamp=False)
+        there_light = there.predict(values, clamp=False, constant=False)
         chain += [
-            Link.sure("regularisation", same_fit(model, trained, config).predict(values, clamp=False)),
+            Link.sure("regularisation", same_fit(model, trained, config).predict(values, clamp=False, constant=False)),
             Link.sure("scenario shift", there_light),
-            Link.sure("measurement", there_light if last is there else last.predict(values, clamp=False)),
+            Link.sure("measurement", there_light if last is there else last.predict(values, clamp=False, constant=False)),
         ]
     else:
-        light = clean_model.predict(values, clamp=False)
+        light = clean_model.predict(values, clamp=False, constant=False)
         last_light = light
         if yard.elsewhere is not None:
-            last_light = fit_config(yard.bounded(yard.elsewhere, yard.train), config, model.method).predict(values, clamp=False)
+            last_light = fit_config(yard.bounded(yard.elsewhere, yard.train), config, model.method).predict(
+                values, clamp=False, constant=False
+            )
         chain += [Link.sure("scenario shift", light), Link.sure("the rest", last_light)]
     return chain, clean_model

@@ -20,7 +20,8 @@ import numpy as np
 
 from ddprt import warp
 from ddprt.axes import Bool, Float32, Float64, Int
-from ddprt.lights import DirectionalLight, Light, Lighting, PointLight, SphereLight, SpotLight
+from ddprt.errors import UserError
+from ddprt.lights import DirectionalLight, EnvironmentLight, Light, Lighting, PointLight, SphereLight, SpotLight
 from ddprt.transport.direct import centred
 from ddprt.transport.embree import Tracer, lifted
 
@@ -49,8 +50,17 @@ class ShadowMap:
 
     @classmethod
     def of(cls, tracer: Tracer, light: Light, resolution: int) -> "ShadowMap":
-        """The map of a light that is given in the tracer's centred frame."""
+        """The map of a light that is given in the tracer's centred frame.
+
+        Raises:
+          UserError: the light comes from all around.
+        """
         anchor = light.anchor()
+        if isinstance(light, EnvironmentLight):
+            raise UserError(
+                "shadow maps: got an environment light, expected light from one place or direction, which such a map can hold; "
+                "leave it out of the lightings"
+            )
         if isinstance(light, DirectionalLight) or anchor is None:
             along = np.array(light.direction, np.float64)  # type: ignore[attr-defined]
             return cls(tracer, -2 * tracer.radius * along, warp.frame(along)[None], tracer.radius, True, resolution)

@@ -2,10 +2,13 @@
 
 import json
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from types import UnionType
 from typing import Any
 
 from ddprt.bench.frontier.page import write_all
+from ddprt.bench.frontier.pareto import COSTS, DRAWN, ERRORS
 from ddprt.bench.measure.settings import Setting, settings_of
 from ddprt.bench.measure.trial import Workshop, about, environment, why
 from ddprt.config import Config
@@ -14,6 +17,9 @@ from ddprt.files import alone_in, append_line, make_folder
 from ddprt.progress import Progress
 
 RESULTS = "results.jsonl"
+_ALWAYS = {"digest": str, "name": str, "changes": dict, "config": str, "failed": str | None, "environment": dict}
+_SURROUNDINGS = {"ddprt": str, "commit": str | None, "when": str, "machine": dict}
+_MEASURED = {"repeats": int, "scores": dict, "floors": dict, "status": str, "remarks": list}
 
 
 def sweep(config: Config, folder: Path, progress: Progress) -> list[Path]:
@@ -36,7 +42,7 @@ def sweep(config: Config, folder: Path, progress: Progress) -> list[Path]:
 
 def _sweep(config: Config, settings: list[Setting], folder: Path, progress: Progress) -> list[Path]:
     path = folder / RESULTS
-    known = read_results(path)
+    known = read_results(path, progress)
     finest = max(setting.config.atlas.resolution for setting in settings)
     workshop = Workshop(config, folder, progress, finest)
     workshop.check(config)
@@ -63,22 +69,51 @@ def _sweep(config: Config, settings: list[Setting], folder: Path, progress: Prog
     return [path, *write_all(folder, records, title=config.scene.name, base_digest=settings[0].digest)]
 
 
-def read_results(path: Path) -> dict[str, dict[str, Any]]:
-    """Records by digest, the last one of each; a line cut short by a kill does not count."""
-    found: dict[str, dict[str, Any]] = {}
+def read_results(path: Path, progress: Progress | None = None) -> dict[str, dict[str, Any]]:
+    """Records by digest, the last one of each.
+
+    Args:
+      path: of results.jsonl; it may be missing.
+      progress: is told how many lines do not count: cut short by a kill, or edited so that something is missing.
+    Raises:
+      UserError: it cannot be read, or is no text.
+    """
     try:
         lines = path.read_text("utf-8").splitlines()
     except FileNotFoundError:
         return {}
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
         raise UserError(f"{path}: cannot be read ({error}); mend its permissions, or delete it to measure anew") from None
-    for line in lines:
-        try:
-            record = json.loads(line)
-            found[record["digest"]] = record
-        except (ValueError, KeyError, TypeError):
-            continue
-    return found
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path}: cannot be read ({error}); save it as UTF-8, or delete it to measure anew") from None
+    records = [record for line in lines if _whole(record := _from_json(line))]
+    if progress and len(records) < len(lines):
+        progress.say(f"{path.name}: {len(records)} of {len(lines)} lines are whole; the others do not count")
+    return {record["digest"]: record for record in records}
+
+
+def _from_json(line: str) -> Any:
+    try:
+        return json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+
+
+def _whole(record: Any) -> bool:
+    """Whether a line holds all that is drawn of a setting, each of its kind."""
+    if not _holds(record, _ALWAYS) or not _holds(record["environment"], _SURROUNDINGS):
+        return False
+    if not _holds(record["environment"]["machine"], {"packages": dict}):
+        return False
+    if record["failed"]:
+        return True
+    if not _holds(record, _MEASURED) or not all(isinstance(remark, str) for remark in record["remarks"]):
+        return False
+    return all(measure.of(record) is not None for measure in (ERRORS["error"], *(COSTS[name] for name in DRAWN)))
+
+
+def _holds(table: Any, kinds: Mapping[str, type | UnionType]) -> bool:
+    return isinstance(table, dict) and all(key in table and isinstance(table[key], kind) for key, kind in kinds.items())
 
 
 def _tried(workshop: Workshop, setting: Setting) -> dict[str, Any]:

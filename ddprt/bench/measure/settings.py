@@ -14,9 +14,10 @@ from ddprt.methods import METHODS
 
 ASKED = ("bench", "sweep", "budget", "tune", "report")
 """Sections that say what is measured, not what is made."""
-BAKED = ("scene", "atlas", "lightings", "points", "transport")
+BAKED = ("scene", "atlas", "lightings", "points", "transport", "effects")
 """Sections that a dataset depends on."""
 _HALVINGS = (8, 4, 2)
+_SENDERS = 128  # along a side, at most, where transport.sender_resolution is 0
 _MOST = 10_000
 """Settings of a sweep: at a second each that is hours, and beyond it a grid that nobody meant."""
 
@@ -122,7 +123,7 @@ def plan_of(config: Config) -> dict[str, tuple[Any, ...]]:
         "export.precision": ("half", "float"),
         "lightings.train": () if config.lightings.file else (*fewer(lightings, 4), 2 * lightings),
         **_rays(config),
-        "transport.sender_resolution": (32, 64, 128) if config.transport.integrator in ("auto", "operator") else (),
+        "transport.sender_resolution": _senders(config),
         "transport.bounces": (1, 2, 4),
         "points.supersample": () if config.points.file else (1, 2, 4, 8, 16),
         "atlas.resolution": (*fewer(resolution, 32)[1:], 2 * resolution) if resolution < 512 else fewer(resolution, 32),
@@ -136,6 +137,22 @@ def _rays(config: Config) -> dict[str, tuple[Any, ...]]:
     if samples == "auto":
         return {"transport.target_noise": tuple(max(1e-4, min(1.0, noise * factor)) for factor in (8, 4, 2, 0.5))}
     return {"transport.samples": tuple(sorted({max(1, samples // 4), max(1, samples // 2), min(65536, 2 * samples)}))}
+
+
+def _senders(config: Config) -> tuple[int, ...]:
+    """Resolutions of senders that make others than there are: senders are whole texels, so several give the same."""
+    if config.transport.integrator not in ("auto", "operator"):
+        return ()
+    found = {_block(config, config.transport.sender_resolution): 0}
+    for side in (32, 64, 128):
+        found.setdefault(_block(config, side), side)
+    return tuple(side for side in found.values() if side)
+
+
+def _block(config: Config, side: int) -> int:
+    """Texels along a sender, as `transport/operator.py` cuts them."""
+    resolution = config.atlas.resolution
+    return max(1, round(resolution / (side or min(resolution, _SENDERS))))
 
 
 def _at(config: Config, key: str) -> Any:

@@ -126,11 +126,9 @@ class Workshop:
         """
         self.check(setting.config)
         folder, sources = self._dataset(setting), self.sources(setting.config)
-        told = folder / _TOLD
-        if told.is_file():
-            before = json.loads(told.read_text("utf-8"))
-            if before["sources"] == sources and measured_here(before["environment"]):
-                return open_dataset(folder), before["bake"]
+        before = _told_of(folder)
+        if before and before["sources"] == sources and measured_here(before["environment"]):
+            return open_dataset(folder), before["bake"]
         shutil.rmtree(folder, ignore_errors=True)
         config, lightings = self._training_only(setting.config)
         scene = configured_scene(config)
@@ -148,7 +146,7 @@ class Workshop:
             "bytes": sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()),
             "peak_gib": peak[0],
         }
-        write_text(told, json.dumps({"bake": record, "sources": sources, "environment": environment()}) + "\n")
+        write_text(folder / _TOLD, json.dumps({"bake": record, "sources": sources, "environment": environment()}) + "\n")
         return data, record
 
     def forget(self, setting: Setting) -> None:
@@ -162,12 +160,13 @@ class Workshop:
             shutil.rmtree(folder, ignore_errors=True)
 
     def holds(self, record: dict[str, Any], setting: Setting) -> bool:
-        """Whether a setting was measured on this truth, from these files, by this version, on a machine like this."""
+        """Whether a setting was measured on this truth, from these files, by this version, on a machine like this, as often."""
         return (
             record.get("schema") == SCHEMA
             and not record.get("failed", True)
             and record.get("truth") == self.truth
             and record.get("sources") == self.sources(setting.config)
+            and record.get("repeats", 0) >= self.config.bench.repeats
             and measured_here(record["environment"])
         )
 
@@ -193,6 +192,7 @@ class Workshop:
             "failed": None,
             "truth": self.truth,
             "sources": self.sources(config),
+            "repeats": repeats,  # that were asked for; of what takes long fewer are made
             "scores": self.yardstick.score(model),
             "floors": {
                 "noise_relative_rmse": self.yardstick.noise,
@@ -275,8 +275,20 @@ def why(error: BaseException) -> str:
 
 def measured_here(there: dict[str, Any]) -> bool:
     """Whether an `environment` has this version and a machine like this; seconds of another say nothing here."""
-    here = machine()
-    return there["ddprt"] == __version__ and all(there["machine"].get(key) == here[key] for key in _MACHINE)
+    here, machine_there = machine(), there.get("machine")
+    alike = isinstance(machine_there, dict) and all(machine_there.get(key) == here[key] for key in _MACHINE)
+    return alike and there.get("ddprt") == __version__
+
+
+def _told_of(folder: Path) -> dict[str, Any] | None:
+    """What a bake noted beside its dataset; None where there is nothing, or somebody spoilt it."""
+    try:
+        before = json.loads((folder / _TOLD).read_text("utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None
+    kinds = {"bake": dict, "sources": str, "environment": dict}
+    whole = isinstance(before, dict) and all(isinstance(before.get(key), kind) for key, kind in kinds.items())
+    return before if whole and isinstance(before["bake"].get("seconds"), float) else None
 
 
 def _nearest(lighting: Lighting, tracer: Tracer) -> float:

@@ -142,7 +142,7 @@ class Yardstick:
         tallies, perceived, energies, pictures, unseen = [], [], [], [], 0
         for row, index in enumerate(self.held_out):
             truth = self._truth(index)
-            unclamped = model.predict(values[row], lightings=self.data.lightings[index], clamp=False)[None]
+            unclamped = model.predict(values[row], lightings=self.data.lightings[index], clamp=False, constant=False)[None]
             predicted = self._carry(model, np.maximum(unclamped, 0))
             tallies.append(truth.tally(predicted))
             perceived.append(pu21_squares(predicted, truth.reference, truth.weight))
@@ -171,7 +171,7 @@ class Yardstick:
         """
         values, tallies = self.measured(model), []
         for row, index in enumerate(self.held_out):
-            predicted = model.predict(values[row], lightings=self.data.lightings[index])[None]
+            predicted = model.predict(values[row], lightings=self.data.lightings[index], constant=False)[None]
             tallies.append(self._truth(index).tally(self._carry(model, predicted)))
         return Tally.joined(tallies)
 
@@ -249,9 +249,8 @@ class Yardstick:
             for index, frame in zip(self.path, values, strict=True):
                 truth = self._truth(index)
                 means.append(truth.means)
-                yield (self._carry(model, model.predict(frame, lightings=self.data.lightings[index])[None]) - truth.reference)[
-                    0
-                ]
+                predicted = model.predict(frame, lightings=self.data.lightings[index], constant=False)[None]
+                yield (self._carry(model, predicted) - truth.reference)[0]
 
         unsteady = jitter(differences(), self.data.area / self.data.area.sum())
         mean = float(np.mean(means))

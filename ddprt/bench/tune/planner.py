@@ -8,9 +8,9 @@ depends on the bases alone and the rest, what even all bases leave, is a power l
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import product
-from math import log
+from math import exp, log
 
 import numpy as np
 from scipy.special import log_ndtr
@@ -39,6 +39,8 @@ _PRIOR: dict[str, tuple[tuple[float, ...], tuple[float, ...], float]] = {
 
 Place = tuple[float, ...]
 """Values of `KNOBS`."""
+Rank = tuple[float, float, float]
+"""How good a plan is, the higher the better: how likely it is to meet the budget, how near it is, how cheap or exact."""
 
 
 @dataclass(frozen=True)
@@ -128,6 +130,7 @@ class Planner:
       bases: numbers of bases that may be asked for, rising.
       precisions: that may be stored.
       limits: the budget; quantities that are missing are free.
+    Attributes:
       trials: what was learned from, at places made of `values`.
       barred: places that cannot be baked, so none that was tried.
     """
@@ -137,9 +140,9 @@ class Planner:
     bases: Sequence[int]
     precisions: Sequence[str]
     limits: Mapping[str, float]
-    trials: list[Trial] = field(default_factory=list)
-    barred: set[Place] = field(default_factory=set)
-    _laws: dict[str, Law] = field(default_factory=dict)
+    trials: list[Trial] = field(default_factory=list, init=False)
+    barred: set[Place] = field(default_factory=set, init=False)
+    _laws: dict[str, Law] = field(default_factory=dict, init=False)
 
     def add(self, trial: Trial) -> None:
         """Learns from a trial."""
@@ -152,28 +155,17 @@ class Planner:
     def next(self) -> tuple[Plan, float]:
         """The plan to try or to take next, and the chance that it meets the budget.
 
-        A plan whose place was tried is taken as soon as it is safe. Before that, the likeliest to meet the budget; of plans
-        that are safe, the cheapest bake. Where no error is asked for it is the least one that is safe, and a place that was
-        tried is only left for one that promises a twentieth less. At least one place was tried before.
+        A plan whose place was tried is taken as soon as it is safe. Before that, the likeliest to meet the budget, or the
+        nearest to it where none is likely at all; of plans that are safe, the cheapest bake. Where no error is asked for it is
+        the least one that is safe, and a place that was tried is only left for one that promises a twentieth less. At least
+        one place was tried before.
         """
-        asked = "relative_rmse" in self.limits
-        best: dict[bool, tuple[tuple[float, float], Plan, float]] = {}
-        for place in product(*self.values):
-            if place in self.barred:
-                continue
-            told = self._of_place(place)
-            for bases, precision in product(self.bases, self.precisions):
-                guesses = self._guesses(told, bases, precision)
-                chance = float(np.exp(sum(guesses[name].chance(limit) for name, limit in self.limits.items())))
-                rank = min(chance, _SURE), -guesses["bake_seconds" if asked else "relative_rmse"].mean
-                tried = told[1]
-                if tried not in best or rank > best[tried][0]:
-                    best[tried] = rank, Plan(place, bases, precision), chance
-        there, elsewhere = best[True], best.get(False)
-        if elsewhere is None:
-            return there[1:]
-        safe = there[0][0] == _SURE and (asked or elsewhere[0][1] - there[0][1] < _WORTHWHILE)
-        return (there if safe or there[0] >= elsewhere[0] else elsewhere)[1:]
+        _, plan, likely = self._next(self.limits)
+        return plan, exp(likely)
+
+    def rank(self, plan: Plan) -> Rank:
+        """How good a plan is, as far as it is known."""
+        return _rank(self.guesses(plan), self.limits)
 
     def hopeless(self, chance: float) -> bool:
         """Whether a chance is too small to go on."""
@@ -185,13 +177,32 @@ class Planner:
             return next(iter(self.limits))
         gains = {}
         for name in self.limits:
-            rest = {other: limit for other, limit in self.limits.items() if other != name}
-            gains[name] = replace(self, limits=rest).next()[1]
+            rank, _, likely = self._next({other: limit for other, limit in self.limits.items() if other != name})
+            gains[name] = *rank[:2], likely  # what a rank ends with is not the same without a limit of the error
         return max(gains, key=lambda name: gains[name])
 
     def guesses(self, plan: Plan) -> dict[str, Guess]:
         """What is expected of a plan: as measured where its place was tried, else by the laws."""
         return self._guesses(self._of_place(plan.place), plan.bases, plan.precision)
+
+    def _next(self, limits: Mapping[str, float]) -> tuple[Rank, Plan, float]:
+        """What `next` says of these limits: with its rank, and the logarithm of its chance."""
+        best: dict[bool, tuple[Rank, Plan, float]] = {}
+        for place in product(*self.values):
+            if place in self.barred:
+                continue
+            told = self._of_place(place)
+            for bases, precision in product(self.bases, self.precisions):
+                guesses = self._guesses(told, bases, precision)
+                rank, tried = _rank(guesses, limits), told[1]
+                if tried not in best or rank > best[tried][0]:
+                    best[tried] = rank, Plan(place, bases, precision), _likely(guesses, limits)
+        there, elsewhere = best[True], best.get(False)
+        if elsewhere is None:
+            return there
+        promised = elsewhere[0][2] - there[0][2]
+        safe = there[0][0] == log(_SURE) and ("relative_rmse" in limits or promised < _WORTHWHILE)
+        return there if safe or there[0] >= elsewhere[0] else elsewhere
 
     def _of_place(self, place: Place) -> tuple[Trial, bool, dict[str, Guess], dict[str, float]]:
         """The trial to tell a place from, whether it is that very place's, the laws there, and how far they moved from it."""
@@ -223,6 +234,22 @@ class Planner:
 
     def _row(self, place: Place) -> np.ndarray:
         return np.concatenate([[1.0], np.log(np.array(place) / np.array(self.base))])
+
+
+def _likely(guesses: Mapping[str, Guess], limits: Mapping[str, float]) -> float:
+    """Logarithm of the chance that all limits are kept."""
+    return float(sum(guesses[name].chance(limit) for name, limit in limits.items()))
+
+
+def _rank(guesses: Mapping[str, Guess], limits: Mapping[str, float]) -> Rank:
+    """Plans that are safe are alike likely, and so are hopeless ones, of which the nearest exceeds the limits by the least.
+
+    So far from its limit, a chance tells how well a quantity is known, not how much too large it is.
+    """
+    likely = _likely(guesses, limits)
+    beyond = sum(max(guesses[name].mean - log(limit), 0.0) for name, limit in limits.items())
+    least = "bake_seconds" if "relative_rmse" in limits else "relative_rmse"
+    return min(max(likely, log(_HOPELESS)), log(_SURE)), -beyond if likely < log(_HOPELESS) else 0.0, -guesses[least].mean
 
 
 def _told(name: str, trial: Trial) -> float:

@@ -125,13 +125,12 @@ class Search:
                 break
             progress.say(f"next: {self._name(plan.place)}, a chance of {chance:.0%}")
             self._tried(plan.place)
-        if not verified:  # the best plan lies where no trial may be made any more
-            plan = self._best_tried()
+        plan = self._best_tried()
+        if plan not in verified:  # a better one lies where no trial may be made any more
             verified[plan] = self._verify(plan)
-        plan = max(verified, key=lambda each: (self._chance(each), -verified[each]["relative_rmse"]))
-        reached, chance = verified[plan], self._chance(plan)
+        plan = max(verified, key=lambda each: (self._meets(verified[each]), planner.rank(each)))
+        reached, chance, met = verified[plan], self._chance(plan), self._meets(verified[plan])
         room = {name: limit / reached[name] for name, limit in self.limits.items()}
-        met = min(room.values()) >= 1
         binding = min(room, key=lambda name: room[name]) if met else planner.binding()
         return Outcome(plan, reached, chance, met, binding, len(planner.trials), self._setting(plan), self.limits)
 
@@ -239,6 +238,9 @@ class Search:
         turned = [(knob, value) for knob, value, base in zip(KNOBS, place, self.base, strict=True) if value != base]
         return ", ".join(f"{knob} = {value:g}" for knob, value in turned) or "as configured"
 
+    def _meets(self, reached: Mapping[str, float]) -> bool:
+        return all(reached[name] <= limit for name, limit in self.limits.items())
+
     def _chance(self, plan: Plan) -> float:
         guesses = self.planner.guesses(plan)
         return float(np.exp(sum(guesses[name].chance(limit) for name, limit in self.limits.items())))
@@ -246,7 +248,7 @@ class Search:
     def _best_tried(self) -> Plan:
         places = [trial.place for trial in self.planner.trials]
         plans = [Plan(*parts) for parts in product(places, self.bases, _PRECISIONS)]
-        return max(plans, key=lambda plan: (self._chance(plan), -self.planner.guesses(plan)["relative_rmse"].mean))
+        return max(plans, key=self.planner.rank)
 
 
 def tune(config: Config, folder: Path, progress: Any) -> Outcome:

@@ -1,0 +1,183 @@
+"""The layer of probes in a dataset: where they stand, and their light under every lighting.
+
+Probes take the light that the senders send to the lightmap, so they cost their own rays alone. Held-out lightings are the mean
+of two independent halves, with half their difference as "noise", as in the lightmap.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from ddprt.axes import Float32
+from ddprt.config import Config
+from ddprt.dataset.layers import Layer, read_layer, write_light, write_places
+from ddprt.dataset.manifest import Manifest, layer_name
+from ddprt.dataset.store import Dataset
+from ddprt.errors import UserError
+from ddprt.progress import Progress
+from ddprt.scene.atlas import Atlas
+from ddprt.scene.mesh import Scene
+from ddprt.transport.effects import Plan, probed
+from ddprt.transport.embree import Tracer
+
+NAME = "probes"
+_NAMED = 8  # probes that a message spells out
+
+
+@dataclass(frozen=True)
+class Sent:
+    """Light on its way from the senders to whatever gathers it.
+
+    Attributes:
+      operator: the scene.
+      bounced: see `Operator.bounce`.
+      address: seed and stream of the random numbers, and the near field.
+    """
+
+    operator: Any
+    bounced: Any
+    address: dict[str, Any]
+
+
+def probe_layers(config: Config, scene: Scene) -> list[dict[str, Any]]:
+    """What dataset.json tells of probes, and all that their light depends on; empty where there are none.
+
+    Raises:
+      UserError: probes cannot be placed, or are asked of an integrator that knows none.
+    """
+    if not probed(config, scene):
+        return []
+    if config.transport.integrator not in ("auto", "operator"):
+        raise UserError(
+            f'transport.integrator: got "{config.transport.integrator}", which knows no probes, expected "auto" or "operator"; '
+            'set one of them, or effects.off = ["probes"]'
+        )
+    probes = import_module("ddprt.transport.probes")
+    position = probes.places(config.probes, scene.bounds)
+    places = {"count": len(position), "digest": probes.digest(position), "rays": config.probes.rays}
+    return [{"name": NAME, "quantity": "irradiance", "order": probes.ORDER, **places}]
+
+
+@dataclass(frozen=True, eq=False)
+class ProbeBake:
+    """What is needed to bake probes.
+
+    Attributes:
+      module: of the effect.
+      layer: the probes.
+      config, tracer, dataset, manifest: of the bake.
+    """
+
+    module: ModuleType
+    layer: Layer
+    config: Config
+    tracer: Tracer
+    dataset: Dataset
+    manifest: Manifest
+
+    @classmethod
+    def of(
+        cls, effects: Plan, config: Config, scene: Scene, tracer: Tracer, atlas: Atlas, dataset: Dataset, manifest: Manifest
+    ) -> "ProbeBake | None":
+        """Places probes, unless they are there; None where a plan does not call for any.
+
+        Probes that are not in free air count nothing, the others together as much as the lightmap.
+
+        Raises:
+          UserError: none is in free air.
+        """
+        module = effects.module(NAME)
+        if module is None:
+            return None
+        if manifest.holds(layer_name(NAME, "places")):
+            return cls(module, read_layer(dataset, NAME), config, tracer, dataset, manifest)
+        position = module.places(config.probes, scene.bounds)
+        valid = module.in_the_open(tracer, position)
+        if not valid.any():
+            raise UserError(
+                f"probes: got {len(position)}, none of them in free air, expected some; move the grid (probes.region_low and "
+                "region_high) or the positions of the file out of solids and walls"
+            )
+        weight = np.where(valid, atlas.area.sum() / valid.sum(), 0.0)
+        layer = Layer(NAME, "irradiance", module.ORDER, position, weight, np.full(len(position), -1))
+        write_places(dataset.folder, layer, manifest)
+        return cls(module, layer, config, tracer, dataset, manifest)
+
+    def run(
+        self,
+        split: str,
+        indices: Sequence[int],
+        sent: Callable[[int], Sent],
+        progress: Progress,
+        *,
+        dark: bool,
+    ) -> None:
+        """Bakes the probes of a split's lightings where some are missing.
+
+        Args:
+          split, indices: "train" (with validation) or "test", and its lightings.
+          sent: the light of each half.
+          progress: told of the stage, and of probes that are not in free air.
+          dark: no light leaves a surface, or none is to be followed.
+        """
+        kinds = ("light", "noise")[: 1 + (split == "test")]
+        names = {index: [layer_name(NAME, index, kind) for kind in kinds] for index in indices}
+        todo = [index for index in indices if not all(map(self.manifest.holds, names[index]))]
+        if not todo:
+            return
+        valid = self.layer.weight > 0
+        with progress.stage(f"probes {split}") as stage:
+            before = self.tracer.rays
+            stage.facts |= {"probes": len(valid), "in_the_open": int(valid.sum())}
+            halves = [np.zeros((len(indices), len(valid), self.layer.coefficients, 3), np.float32) for _ in kinds]
+            if not dark:
+                rays = 0
+                for half, light in enumerate(halves):
+                    source = sent(half)
+                    if not rays:
+                        rays = self._rays(source, len(kinds), stage)
+                        stage.pace(len(kinds) * rays * int(valid.sum()))
+                    light[:, valid] = self._gathered(source, rays, stage)
+            for index in todo:
+                parts = [half[indices.index(index)] for half in halves]
+                both = [sum(parts) / len(parts), (parts[0] - parts[-1]) / 2]
+                for kind, values in zip(kinds, both, strict=False):
+                    write_light(self.dataset.folder, NAME, index, values, self.manifest, kind)
+            stage.facts["rays"] = self.tracer.rays - before
+        self._name_shut(progress)
+
+    def _rays(self, source: Sent, halves: int, stage: Any) -> int:
+        """Rays of each probe, as configured or as the noise that is aimed at asks."""
+        given = self.config.probes.rays
+        if given == "auto":
+            position, target = self.layer.position[self.layer.weight > 0], self.config.transport.target_noise
+            radiosity = source.bounced.radiosity
+            rays, noise = self.module.choose_rays(source.operator, radiosity, position, target, halves=halves, **source.address)
+            stage.facts["noise_expected"] = float(f"{noise:.3g}")
+        else:
+            rays = self.module.power_of_two(given)
+        stage.facts["samples"] = rays * halves
+        return int(rays)
+
+    def _gathered(self, source: Sent, rays: int, stage: Any) -> Float32[np.ndarray, "lightings valid harmonics 3"]:
+        position = self.layer.position[self.layer.weight > 0]
+        parts = []
+        for part in self.module.gather(source.operator, source.bounced.radiosity, position, rays, **source.address):
+            parts.append(part)
+            stage.advance(rays * part.shape[1])
+        return np.concatenate(parts, 1)
+
+    def _name_shut(self, progress: Progress) -> None:
+        """Names the probes that are not in free air."""
+        shut = np.flatnonzero(self.layer.weight == 0)
+        if len(shut):
+            told = ", ".join(f"{i} at {np.round(self.layer.position[i], 4).tolist()}" for i in shut[:_NAMED])
+            more = f" and {len(shut) - _NAMED} more" if len(shut) > _NAMED else ""
+            progress.warn(
+                f"probes: {len(shut)} of {len(self.layer.position)} stand inside solids or behind walls, and stay dark: "
+                f"{told}{more}"
+            )

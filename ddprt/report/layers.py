@@ -1,0 +1,57 @@
+"""How well layers are answered for on the held-out lightings; see `ddprt.dataset.layers`."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ddprt.axes import Float32
+from ddprt.dataset.layers import QUANTITIES, LayerData
+from ddprt.dataset.store import Dataset
+from ddprt.report.evaluate import projected
+from ddprt.runtime.model import LayerModel, Model
+
+Coefficients = Float32[np.ndarray, "lightings entries 3"]
+
+
+def layer_scores(data: Dataset, model: Model) -> dict[str, Any]:
+    """Errors of a model's layers, by name.
+
+    Returns:
+      relative_rmse: root of the mean square irradiance of the error, over the sphere, all places by their weight, lightings and
+        channels, as a share of the mean irradiance; None where there is no light. noise_relative_rmse is the same of what the
+        held-out light is uncertain by, projection_relative_rmse of what the best coefficients on the basis would leave. curve:
+        the error of the first 1, 2, 4, ... bases alone, up to all. Where the method has no basis: no projection and no curve.
+    """
+    return {name: _scores(data, part) for name, part in model.layers.items()}
+
+
+def _scores(data: Dataset, part: LayerModel) -> dict[str, Any]:
+    layer, model, test = part.layer, part.model, data.split("test")
+    own = LayerData.of(data, layer)
+    values, reference = data.values(test, model.points, model.quantity), own.maps("indirect", test)
+    whole = 3 * len(test) * layer.weight.sum()
+    first = reference.reshape(len(test), *own.covered.shape, 3)[:, :, 0]
+    mean = float(np.einsum("lpc,p->", first, layer.weight, dtype=np.float64) / whole) * QUANTITIES[layer.quantity] ** 0.5
+
+    def share(error: Coefficients) -> float | None:
+        square = sum(np.einsum("ec,ec,e->", row, row, own.area, dtype=np.float64) for row in error) / whole
+        return float(np.sqrt(square) / mean) if mean > 0 else None
+
+    found: dict[str, Any] = {
+        "places": int((layer.weight > 0).sum()),
+        "relative_rmse": share(model.predict(values, clamp=False) - reference),
+        "noise_relative_rmse": share(own.maps("noise", test)),
+    }
+    basis = getattr(model.relighter, "basis", None)
+    if basis is None or len(basis) == 0:
+        return found
+    vectors, centre = np.asarray(basis, np.float64), np.asarray(getattr(model.relighter, "mean", 0.0), np.float64)
+    best = projected(model.encoding, vectors, centre, values, reference, own.area, clamp=False)
+    found["projection_relative_rmse"] = share(best - reference)
+    found["curve"] = []
+    for bases in sorted({*(2**power for power in range(len(basis).bit_length())), len(basis)}):
+        shorter = replace(model, relighter=model.relighter.truncated(bases))  # type: ignore[attr-defined]
+        error = share(shorter.predict(values, clamp=False) - reference)
+        found["curve"].append({"bases": bases, "relative_rmse": error})
+    return found
