@@ -26,11 +26,11 @@ import numpy as np
 from jaxtyping import Array, Float, Float64
 from pydantic import Field
 
+from ddprt import harmonics
 from ddprt.errors import UserError
 from ddprt.fitting.basis import entry_weights
 from ddprt.fitting.selection import RANK_CUT, Spectrum, choose_ridge, decompose
 from ddprt.fitting.transfer import solve_transfer
-from ddprt.harmonics import count, harmonics
 from ddprt.methods.method import (
     Examples,
     FitReport,
@@ -54,13 +54,13 @@ def describe(lightings: Sequence[Any], order: int) -> Float64[np.ndarray, "light
     Raises:
       UserError: a light that has a place.
     """
-    found = np.zeros((len(lightings), count(order), 3))
+    found = np.zeros((len(lightings), harmonics.count(order), 3))
     for row, lights in zip(found, lightings, strict=True):
         for light in lights:
             if hasattr(light, "harmonics"):
                 row += light.harmonics(order)
             elif light.kind == "directional":
-                row += np.outer(harmonics(-np.array(light.direction), order), light.irradiance)
+                row += np.outer(harmonics.harmonics(-np.array(light.direction), order), light.irradiance)
             else:
                 raise UserError(
                     f"sh-prt: got a light of type {light.kind}, which stands somewhere; expected distant light, as "
@@ -125,16 +125,16 @@ class ShPrt(Method):
         choice = choose_ridge(spectra, weight, [lit[c] for c in seen]) if self.ridge == "auto" and seen else None
         ridge = choice.ridge if choice else self.ridge if self.ridge != "auto" else 0.0
         solved = [solve_transfer(spectrum, ridge, None, w) for spectrum, w in zip(spectra, weight, strict=True)]
-        transfer = np.zeros((count(self.order), light.shape[1], 3))
+        transfer = np.zeros((harmonics.count(self.order), light.shape[1], 3))
         for c in seen:
             rows = lit[c]
             transfer[:, :, c] = _solution(X[rows, :, c], ridge) * relative[rows, c] @ light[rows, :, c].astype(np.float64)
         transfer *= window(self.window, self.order)[:, None, None]
         remarks = {name for one in solved for name in one.remarks if name != "rank_deficient"}  # which speaks of bases there
-        few = any(one.rank < count(self.order) for one in solved)
+        few = any(one.rank < harmonics.count(self.order) for one in solved)
         dark = not (light.any() and scale.any())
         report = FitReport(
-            bases=count(self.order),
+            bases=harmonics.count(self.order),
             numerical_rank=max((one.rank for one in solved), default=0),
             condition=tuple(one.condition for one in solved),
             ranks=tuple(one.rank for one in solved),
