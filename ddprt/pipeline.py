@@ -16,6 +16,7 @@ from ddprt.dataset.generate import bake, other_settings
 from ddprt.dataset.store import Dataset, open_dataset
 from ddprt.errors import UserError
 from ddprt.files import make_folder, write_text
+from ddprt.lights import LIGHTS
 from ddprt.machine import machine, peak_memory_gib
 from ddprt.progress import Progress
 from ddprt.scene.mesh import Scene
@@ -213,6 +214,12 @@ class Run:
 
         return sweep(self.config, self.folder / "bench", self.progress)
 
+    def ablate(self) -> str:
+        """Bakes with each effect and without (`ddprt bench --effects`); the table, and files in the folder `bench`."""
+        from ddprt.bench.effects.ablation import ablation, table
+
+        return table(ablation(self.config, self.folder / "bench", self.progress))
+
     def tune(self) -> Any:
         """Searches a setting within the limits of [tune]; see `ddprt.bench.tune.search.Outcome`."""
         from ddprt.bench.tune.search import tune
@@ -265,23 +272,40 @@ class Run:
 def _effects(effects: Plan, stages: list[dict[str, Any]], data: Dataset) -> list[dict[str, Any]]:
     """The plan with what each effect cost and what it gave.
 
-    Shares are of all irradiance of all lightings; direct light is shared out equally among the kinds of a lighting's lights.
+    A stage belongs to the effect whose name it begins with; those of direct light to every kind of light, those of indirect
+    light to the bounces. Shares are of all irradiance of all lightings; direct light is shared out equally among the kinds of a
+    lighting's lights. None stands for what cannot be told apart: what an effect does within the stages of others, which
+    `ddprt bench --effects` measures.
     """
     weight = data.area / data.area.sum()
     indices = range(len(data.lightings))
     direct = np.array([np.einsum("tc,t->", data.maps("direct", [i])[0], weight) for i in indices])
-    indirect = float(sum(np.einsum("tc,t->", data.maps("indirect", [i])[0], weight) for i in indices))
-    total = float(direct.sum()) + indirect
-    by_kind: dict[str, float] = {}
-    for energy, lighting in zip(direct, data.lightings, strict=True):
+    energy: dict[str, float] = {
+        "diffuse bounces": float(sum(np.einsum("tc,t->", data.maps("indirect", [i])[0], weight) for i in indices)),
+        **_constant(data, weight),
+    }
+    for amount, lighting in zip(direct, data.lightings, strict=True):
         for light in lighting:
-            by_kind[light.kind] = by_kind.get(light.kind, 0.0) + float(energy) / len(lighting)
-    rows = []
+            kind = f"{light.kind} lights"
+            energy[kind] = energy.get(kind, 0.0) + float(amount) / len(lighting)
+    total, rows = sum(energy.values()), []
     for effect in effects.effects:
-        bounces = effect.name == "diffuse bounces"
-        of = "indirect" if bounces else "direct" if effect.name.endswith(" lights") else effect.name
-        own = [s for s in stages if str(s["name"]).startswith(of) and effect.called]
-        share = indirect if bounces else by_kind.get(effect.name.removesuffix(" lights"), 0.0)
-        cost = {"rays": sum(int(s.get("rays", 0)) for s in own), "seconds": round(sum(float(s["seconds"]) for s in own), 4)}
-        rows.append({**asdict(effect), **cost, "energy_share": share / total if total > 0 else 0.0})
+        lights = effect.name.removesuffix(" lights") in LIGHTS
+        begins = "indirect" if effect.name == "diffuse bounces" else "direct" if lights else effect.name
+        own = [stage for stage in stages if f"{stage['name']} ".startswith(f"{begins} ") and effect.called]
+        rays, seconds = sum(int(s.get("rays", 0)) for s in own), sum(float(s["seconds"]) for s in own)
+        apart = bool(own) or not effect.called
+        share = energy.get(effect.name, None if effect.called else 0.0)
+        rows.append(
+            asdict(effect)
+            | {"rays": rays if apart else None, "seconds": round(seconds, 4) if apart else None}
+            | {"energy_share": share / total if share and total > 0 else share}
+        )
     return rows
+
+
+def _constant(data: Dataset, weight: np.ndarray) -> dict[str, float]:
+    """Light that no lighting changes, of each lighting, where the dataset has some."""
+    if data.constant is None:
+        return {}
+    return {"emission": len(data.lightings) * float(np.einsum("tc,t->", data.constant, weight))}

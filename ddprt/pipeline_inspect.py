@@ -21,7 +21,7 @@ def describe(source: str, overrides: dict[str, str]) -> str:
       source: a configuration, a scene name or a mesh file.
       overrides: of the configuration.
     """
-    from ddprt.dataset.generate import check_points
+    from ddprt.dataset.generate import baked_settings, check_points
     from ddprt.transport.effects import configured_scene, plan
     from ddprt.transport.embree import Tracer
     from ddprt.transport.openness import build_open_atlas
@@ -56,23 +56,22 @@ def describe(source: str, overrides: dict[str, str]) -> str:
     settings = config.lightings
     lightings, told = _some_lightings(config, scene, tracer)
     lines += told
-    for effect in plan(scene, lightings, bounces=config.transport.bounces, probes=config.probes.asked).effects:
-        if not lightings and effect.name.endswith(" lights"):
-            continue  # nobody knows
-        state = "called for" if effect.called else "left out"
-        most = "any amount" if effect.bound is None else f"{effect.bound:.2g}"
-        bound = "" if effect.called else f"; at most {most} of the direct light"
-        lines.append(f"effect      {effect.name}: {state}{' (forced)' if effect.forced else ''}: {effect.why}{bound}")
     count = settings.train + settings.validation + settings.test
     shadow = atlas.count * config.transport.direct_samples * count
-    lines.append(f"a bake      {count} lightings: {amount(shadow)} shadow rays per lamp")
-    if not lightings:
-        return "\n".join(lines)
-    direct = _direct(config, tracer, atlas, lightings)
-    lines += _darkness(lightings, direct, scene, tracer)
-    if any(light.any() for light in direct) and plan(scene, lightings, bounces=config.transport.bounces).bounces:
-        lines += _gathering(config, tracer, atlas, lightings, direct)
-    return "\n".join(lines)
+    bake = [f"a bake      {count} lightings: {amount(shadow)} shadow rays per lamp"]
+    effects = plan(scene, lightings, bounces=config.transport.bounces, probes=config.probes.asked)
+    costs: dict[str, str] = {}
+    if lightings:
+        direct, costs = _direct(config, tracer, atlas, lightings, count)
+        bake += _darkness(lightings, direct, scene, tracer)
+        integrator = baked_settings(config, scene)["transport"]["integrator"]
+        if effects.bounces and integrator != "operator":
+            bake.append(f"            indirect light by {integrator}, whose rays `ddprt bake --dry-run` tells")
+        elif effects.bounces and any(light.any() for light in direct):
+            told, costs["diffuse bounces"] = _gathering(config, tracer, atlas, lightings, direct)
+            bake += told
+    known = [line for line in effects.lines(costs) if lightings or not line.split(":")[0].endswith(" lights")]
+    return "\n".join([*lines, *(f"effect      {line}" for line in known), *bake])
 
 
 def _some_lightings(config: Config, scene: Any, tracer: Any) -> tuple[Any, list[str]]:
@@ -107,12 +106,21 @@ def _some_lightings(config: Config, scene: Any, tracer: Any) -> tuple[Any, list[
     return found.lightings, [f"lightings   {settings.distribution}: {tried}"]
 
 
-def _direct(config: Config, tracer: Any, atlas: Any, lightings: Any) -> list[np.ndarray]:
-    """Direct light of each lighting on the texels."""
+def _direct(config: Config, tracer: Any, atlas: Any, lightings: Any, count: int) -> tuple[list[np.ndarray], dict[str, str]]:
+    """Direct light of each lighting on the texels, and what each kind of light will take for so many lightings, in words."""
     from ddprt.transport.direct import Texels
 
     texels = Texels.of(tracer, atlas, config.transport.direct_samples, seeds.stream(config.seed, "texel positions"))
-    return [texels.irradiance(lighting, seeds.stream(config.seed, "direct", index)) for index, lighting in enumerate(lightings)]
+    found, rays = [], dict[str, int]()
+    for index, lighting in enumerate(lightings):
+        stream, total = seeds.stream(config.seed, "direct", index), np.zeros((atlas.count, 3), np.float32)
+        for kind in dict.fromkeys(light.kind for light in lighting):
+            before = tracer.rays
+            total += texels.irradiance(tuple(light for light in lighting if light.kind == kind), stream)
+            rays[kind] = rays.get(kind, 0) + tracer.rays - before
+        found.append(total)
+    share = count / len(lightings)
+    return found, {f"{kind} lights": f"about {amount(traced * share)} shadow rays" for kind, traced in rays.items()}
 
 
 def _darkness(lightings: Any, direct: list[np.ndarray], scene: Any, tracer: Any) -> list[str]:
@@ -129,23 +137,26 @@ def _darkness(lightings: Any, direct: list[np.ndarray], scene: Any, tracer: Any)
     return [f"            {told}"]
 
 
-def _gathering(config: Config, tracer: Any, atlas: Any, lightings: Any, direct: list[np.ndarray]) -> list[str]:
-    """What the operator would choose for these lightings."""
+def _gathering(config: Config, tracer: Any, atlas: Any, lightings: Any, direct: list[np.ndarray]) -> tuple[list[str], str]:
+    """What the operator would choose for these lightings, and how many rays its maps of all lightings take, in words."""
     from ddprt.transport.effort import choose_rays
     from ddprt.transport.operator import Operator
 
     operator = Operator.of(tracer, atlas, config.transport.sender_resolution)
     averaged = np.concatenate([operator.averaged(light) for light in direct], 1)
-    lines = []
-    for name, held_out in (("training", False), ("held-out", True)):
+    lines, traced = [], 0.0
+    for name, halves in (("training", 1), ("held-out", 2)):
         address: dict[str, Any] = {"seed": config.seed, "stream": f"inspect {name}"}
+        before = tracer.rays
         radiosity = operator.bounce(averaged, bounces=config.transport.bounces, **address).radiosity
+        traced += halves * (tracer.rays - before)
         near = operator.near(lightings, averaged, bounces=config.transport.bounces)
-        facts = choose_rays(operator, radiosity, config.transport, near=near, held_out=held_out, **address).facts
+        facts = choose_rays(operator, radiosity, config.transport, near=near, held_out=halves == 2, **address).facts
         rays, noise = facts["samples"], 100 * facts["noise_expected"]
         total = amount(rays * atlas.count)
+        traced += rays * atlas.count
         lines.append(f"            {name} maps: {rays:g} gather rays per texel ({total}), noise about {noise:.2g} %")
-    return lines
+    return lines, f"about {amount(traced)} rays for all lightings together"
 
 
 def checkup() -> tuple[str, bool]:

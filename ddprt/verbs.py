@@ -106,10 +106,16 @@ def evaluate(call: Call) -> None:
 
 def bench(call: Call) -> None:
     """try settings about a configuration: error against seconds, bytes and memory"""
+    if call.asks("peers") and call.asks("effects"):
+        raise UserError("ddprt bench: got --peers and --effects, expected one of them; run it once for each")
     if call.asks("peers"):
         return peers(call)
     if call.asks("quick"):
         raise UserError("--quick: got no --peers, which it belongs to; a sweep is shortened by --sweep.SECTION.KEY")
+    if call.asks("effects"):
+        job = call.run()
+        print(f"{job.ablate()}\nresults:  {job.folder / 'bench' / 'effects.jsonl'}")
+        return None
     results, page, *others = call.run().sweep()
     print(f"results:  {results}\npage:     {page}\nfigures:  {others[-1].parent}")
     return None
@@ -268,6 +274,7 @@ VERBS = {
         options=_OUT,
         flags={
             "peers": "compare fit, transfer and relighting with other libraries; FILE may be left out",
+            "effects": "what each effect that is called for changes in light, seconds and rays",
             "quick": "less of it",
         },
     ),

@@ -29,7 +29,14 @@ WALK = [
     "verbs",
     "cli",
 ]
-BENCH = {"measure": [], "budget": [], "frontier": ["measure"], "tune": ["measure"], "peers": ["measure"]}
+BENCH = {
+    "measure": [],
+    "budget": [],
+    "frontier": ["measure"],
+    "tune": ["measure"],
+    "peers": ["measure"],
+    "effects": ["measure"],
+}
 """The parts of that room, and which other parts each may import."""
 FILES = sorted(PACKAGE.rglob("*.py"))
 NUMPY_ROOMS = {"scene", "lights", "sampling", "transport", "dataset", "export", *GROUND, "config"}

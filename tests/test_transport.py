@@ -10,14 +10,13 @@ from scipy import stats
 
 import ddprt
 from ddprt.errors import UserError
-from ddprt.lights import LIGHTS, Lighting, parse_lighting
+from ddprt.lights import Lighting, parse_lighting
 from ddprt.scene.atlas import Atlas, build_atlas
 from ddprt.scene.checks import checked
 from ddprt.scene.library import build
 from ddprt.scene.material import Material
 from ddprt.scene.mesh import Scene
-from ddprt.scene.shapes import box, faceted, icosphere, rectangle
-from ddprt.transport.effects import EFFECTS, plan, sees_nothing
+from ddprt.scene.shapes import faceted, icosphere, rectangle
 from ddprt.transport.embree import Tracer
 from ddprt.transport.measure import measure
 from ddprt.transport.openness import open_atlas
@@ -298,110 +297,6 @@ def test_sender_bias_falls_with_resolution(cornell: Scene, cornell_atlas: Atlas)
     bias = [np.sqrt(np.mean((values[size] - values[64]) ** 2)) / values[64].mean() for size in (4, 8, 16, 32)]
     assert bias[0] > bias[1] > bias[2] > bias[3]
     assert bias[3] < 0.1
-
-
-# --- what costs nothing -----------------------------------------------------------------------------------------------
-
-
-def single(name: str, quads: np.ndarray, albedo: float = 0.8) -> Scene:
-    return faceted(name, quads, (Material("plain", (albedo,) * 3),))
-
-
-@pytest.mark.parametrize("name", ["black", "convex"])
-def test_black_and_convex_scenes_trace_shadow_rays_alone(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = build("furnace", albedo=0.0, subdivisions=2) if name == "black" else build("convex")
-    lamp = CENTRE if name == "black" else parse_lighting({"type": "point", "position": [0, 2, 0.3], "intensity": [1, 1, 1]})
-    atlas = build_atlas(scene, 32)
-    decided = plan(scene, [lamp])
-    assert decided.bounces == 0
-    assert not decided.called("diffuse bounces")
-    monkeypatch.setattr(Tracer, "first", None)
-    tracer = Tracer.of(scene)
-    found = trace_reference(
-        tracer, scene, lamp, on_texels(tracer, atlas, np.arange(atlas.count)), atlas.count, 4, seed=0, bounces=decided.bounces
-    )
-    towards = lamp[0].anchor() - atlas.position
-    facing = np.einsum("nd,nd->n", towards, atlas.geometric_normal) > 0
-    assert tracer.rays == 4 * facing.sum()
-    assert found.direct.any()
-    assert not found.indirect.any()
-
-
-def test_a_black_room_is_probed_without_bounce_rays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Tracer, "first", None)
-    direct, indirect = ddprt.irradiance(
-        build("furnace", albedo=0, subdivisions=1), CENTRE, [[0, 0.5, 0]], [[0, -1, 0]], samples=2
-    )
-    np.testing.assert_allclose(direct, 4, rtol=1e-4)  # the origin stands 7e-6 off
-    assert not indirect.any()
-
-
-CONVEX = {
-    "cube": lambda: build("convex"),
-    "cube far away": lambda: single("far", box(np.full(3, 1e4), np.full(3, 1e4 + 1))),
-    "one square": lambda: single("square", np.array([rectangle((0.0, 0.0), (1.0, 1.0), 0.0, 1, facing=1)])),
-    "sphere from outside": lambda: checked("ball", *icosphere(2)),
-    "back to back": lambda: single(
-        "sheets", np.array([rectangle((0.0, 0.0), (1.0, 1.0), at, 1, facing=f) for at, f in ((0.0, -1), (0.1, 1))])
-    ),
-}
-
-
-@pytest.mark.parametrize("name", CONVEX)
-def test_what_sees_nothing(name: str) -> None:
-    assert sees_nothing(CONVEX[name]())
-
-
-@pytest.mark.parametrize("name", ["cornell", "plates", "furnace", "corridor", "statue"])
-def test_what_sees_something(name: str, request: pytest.FixtureRequest) -> None:
-    assert not sees_nothing(request.getfixturevalue(name))
-
-
-def test_a_dent_is_noticed() -> None:
-    points, triangles = icosphere(2)
-    points[0] *= 0.9
-    assert not sees_nothing(checked("dented", points, triangles))
-
-
-def test_two_cubes_see_each_other() -> None:
-    one, two = box(np.zeros(3), np.ones(3)), box(np.full(3, 2.0), np.full(3, 3.0))
-    assert not sees_nothing(single("two", np.concatenate([one, two])))
-
-
-# --- the plan ---------------------------------------------------------------------------------------------------------
-
-
-def test_a_plan_names_every_effect_and_why(cornell: Scene) -> None:
-    decided = plan(cornell, [LAMP, parse_lighting([SPOT, SUN])])
-    assert [effect.name for effect in decided.effects] == list(EFFECTS)
-    assert list(EFFECTS)[: 1 + len(LIGHTS)] == ["diffuse bounces", *(f"{kind} lights" for kind in LIGHTS)]
-    called = {effect.name: effect.called for effect in decided.effects[: 1 + len(LIGHTS)]}
-    assert called == {
-        "diffuse bounces": True, "point lights": True, "spot lights": True, "directional lights": True, "rect lights": False,
-        "sphere lights": False, "environment lights": False,
-    }  # fmt: skip
-    assert decided.bounces == -1
-    assert "white" in decided.effects[0].why
-    assert decided.effects[2].why == "1 of 2 lightings, first 1"
-    assert all(effect.bound == 0 for effect in decided.effects)
-    assert not any(effect.forced for effect in decided.effects)
-
-
-@pytest.mark.parametrize("bounces", [0, 1, 3])
-def test_forced_bounces_come_with_a_bound(bounces: int) -> None:
-    scene = build("furnace", albedo=0.5, subdivisions=1)
-    decided = plan(scene, [CENTRE], bounces=bounces)
-    assert decided.bounces == bounces
-    assert decided.effects[0].forced
-    assert decided.effects[0].called is (bounces > 0)
-    # a^(B + 1) + a^(B + 2) + ... of the largest direct light; in a furnace it is exactly what is missing.
-    assert decided.effects[0].bound == pytest.approx(0.5 ** (bounces + 1) / 0.5)
-
-
-def test_an_effect_that_cannot_occur_is_not_forced_on() -> None:
-    assert plan(build("convex"), [LAMP], bounces=5).bounces == 0
-    assert plan(build("furnace", albedo=0, subdivisions=1), [LAMP], bounces=5).bounces == 0
-    assert plan(build("furnace", albedo=1, subdivisions=1), [LAMP], bounces=2).effects[0].bound is None
 
 
 # --- laws -------------------------------------------------------------------------------------------------------------

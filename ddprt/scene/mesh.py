@@ -29,7 +29,7 @@ class Scene:
       notes: what the checks repaired, one line each.
       whole: the scene that this one is, when a user has left effects out of it; see `ddprt.transport.effects.force`.
       forced: effects that a user wants simulated whatever the materials say.
-      refused: effects that a user has left out.
+      refused: effects that a user wants left out likewise.
     """
 
     name: str

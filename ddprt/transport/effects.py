@@ -5,10 +5,10 @@ is left out, an upper bound of the light it could have added. A new effect is on
 plan calls for it, and one entry of `EFFECTS`, which decides by what scene and lightings say of themselves.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from importlib import import_module
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 
 import numpy as np
 
@@ -16,11 +16,13 @@ from ddprt.catalogue import Catalogue
 from ddprt.config import Config
 from ddprt.errors import UserError
 from ddprt.lights import LIGHTS, Lighting, parse_lighting
+from ddprt.progress import amount
 from ddprt.scene.files import load_scene
 from ddprt.scene.holes import pierced
 from ddprt.scene.material import Material
 from ddprt.scene.mesh import Scene
 from ddprt.scene.sheets import backs, without_backs
+from ddprt.sections import TransportConfig
 
 _FLAT = 1e-6  # of the radius: how far a corner may stand before a triangle's plane and still be in it
 _CHUNK = 1 << 22
@@ -52,18 +54,41 @@ class Plan:
     Attributes:
       effects: every entry of `EFFECTS`, in order.
       bounces: -1 follows light until nothing is left, 0 traces none.
+      costs: what effects that are called for will take, in words, by name, as far as scene and lightings tell.
     """
 
     effects: tuple[Effect, ...]
     bounces: int
+    costs: Mapping[str, str] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return "\n".join(self.lines())
+
+    def lines(self, costs: Mapping[str, str] = MappingProxyType({})) -> list[str]:
+        """A line for each effect: called for or not, why, and its cost or the bound of what leaving it out can cost.
+
+        Args:
+          costs: in words, by name of the effect, where more is known than the plan knew.
+        """
+        costs, rows = {**self.costs, **costs}, []
+        for effect in self.effects:
+            most = "any amount" if effect.bound is None else f"{effect.bound:.2g}"
+            cut = effect.bound is None or effect.bound > 0
+            told = [costs[effect.name]] if effect.called and effect.name in costs else []
+            told += [f"at most {most} of the direct light is left out"] if effect.called and cut else []
+            told += [] if effect.called else [f"at most {most} of the direct light"]
+            state = f"{'called for' if effect.called else 'left out'}{' (forced)' if effect.forced else ''}"
+            rows.append("; ".join([f"{effect.name}: {state}: {effect.why}", *told]))
+        return rows
 
     def called(self, name: str) -> bool:
         """Whether an effect is simulated."""
         return any(effect.called for effect in self.effects if effect.name == name)
 
     def module(self, name: str) -> ModuleType | None:
-        """The file of an effect, imported now; None where it is not called for."""
-        return import_module(f"ddprt.transport.{EFFECTS[name].module}") if self.called(name) else None
+        """The file of an effect, imported now; None where it is not called for, or has none of its own."""
+        file = EFFECTS[name].module
+        return import_module(f"ddprt.transport.{file}") if file and self.called(name) else None
 
 
 @dataclass(frozen=True)
@@ -73,12 +98,14 @@ class Question:
     Attributes:
       scene, lightings: of the bake.
       bounces: asked for; -1 lets the scene decide.
+      direct_samples: shadow rays per texel and light.
       probes: which are asked for, in words; empty for none.
     """
 
     scene: Scene
     lightings: Sequence[Lighting]
     bounces: int = -1
+    direct_samples: int = TransportConfig().direct_samples
     probes: str = ""
 
     def users(self, has: Callable[[Material], object]) -> str:
@@ -92,38 +119,54 @@ class Entry:
     """How an effect is decided on, and where it lives.
 
     Attributes:
-      decide: the line of a plan that nobody forces; never imports the effect's file.
+      decide: the line of a plan that nobody forces; never imports the effect's file. What can be forced is decided on by the
+        scene alone.
       module: its file in `ddprt.transport`; empty for what transport always has.
       without: the scene with what calls for the effect taken out; None where it cannot be forced.
       left: bound of the light left out when it is forced off; None where it is unbounded.
+      cost: what it will take, in words; empty where scene and lightings do not tell.
     """
 
     decide: Callable[[str, Question], Effect]
     module: str = ""
     without: Callable[[Scene], Scene] | None = None
     left: Callable[[Question], float | None] = lambda question: None
+    cost: Callable[[Question], str] = lambda question: ""
 
 
-def plan(scene: Scene, lightings: Sequence[Lighting], *, bounces: int = -1, probes: str = "") -> Plan:
+def plan(
+    scene: Scene,
+    lightings: Sequence[Lighting],
+    *,
+    bounces: int = -1,
+    direct_samples: int = TransportConfig().direct_samples,
+    probes: str = "",
+) -> Plan:
     """Decides what to simulate.
 
     Args:
       scene: its materials and shape; from `force` where the user decides.
       lightings: all that will be baked.
       bounces: -1 lets the scene decide; 0 and up is forced.
+      direct_samples: shadow rays per texel and light, for what it will cost.
       probes: which are asked for, in words (`config.probes.asked`); empty for none.
+    Returns:
+      A plan; printed, it has a line for each effect.
     """
     parsed = [parse_lighting(lighting, f"lighting {index}") for index, lighting in enumerate(lightings)]
-    question = Question(scene, parsed, bounces, probes)
+    question = Question(scene, parsed, bounces, direct_samples, probes)
     effects = tuple(_decided(name, entry, question) for name, entry in EFFECTS.items())
-    return Plan(effects, bounces if effects[0].called else 0)
+    told = {effect.name: EFFECTS[effect.name].cost(question) for effect in effects if effect.called}
+    return Plan(effects, bounces if effects[0].called else 0, {name: cost for name, cost in told.items() if cost})
 
 
 def force(scene: Scene, *, on: Sequence[str] = (), off: Sequence[str] = ()) -> Scene:
     """A scene whose plan simulates some effects, or leaves them out, whatever it calls for by itself.
 
+    What is said of an effect replaces what was said of it before, and what changes nothing gives the scene itself back.
+
     Args:
-      scene: from `ddprt.load_scene`.
+      scene: from `ddprt.load_scene` or from here.
       on, off: entries of `EFFECTS`. What is off is left out by taking out of the scene what calls for it.
     Raises:
       UserError: unknown names, effects that cannot be forced, or both on and off.
@@ -135,13 +178,17 @@ def force(scene: Scene, *, on: Sequence[str] = (), off: Sequence[str] = ()) -> S
             raise UserError(f'effects: got "{name}", which cannot be forced, expected some of {can}{also}')
         if name in on and name in off:
             raise UserError(f'effects: got "{name}" both on and off, expected one or the other; choose')
-    whole, left = scene.whole or scene, scene
-    for name in off:
-        without = EFFECTS[name].without
-        left = without(left) if without else left
-    forced, refused = ({*said} - {*other} for said, other in (((*scene.forced, *on), off), ((*scene.refused, *off), on)))
-    cut = whole if left is not whole else None
-    return replace(left, whole=cut, forced=tuple(sorted(forced)), refused=tuple(sorted(refused)))
+    if not on and not off:
+        return scene
+    forced, refused = {*scene.forced, *on} - {*off}, {*scene.refused, *off} - {*on}
+    unforced = replace(scene.whole or scene, forced=(), refused=())
+    alone = {name: EFFECTS[name].decide(name, Question(unforced, ())) for name in {*forced, *refused}}
+    forced = {name for name in forced if not alone[name].called or alone[name].bound != 0}  # the others change nothing
+    left = whole = replace(unforced, forced=tuple(sorted(forced)))
+    for name, entry in EFFECTS.items():
+        if name in refused and alone[name].called and entry.without:
+            left = entry.without(left)
+    return replace(left, whole=whole if left is not whole else None, refused=tuple(sorted(refused)))
 
 
 def configured_scene(config: Config) -> Scene:
@@ -150,17 +197,16 @@ def configured_scene(config: Config) -> Scene:
 
 
 def _decided(name: str, entry: Entry, question: Question) -> Effect:
-    effect, whole = entry.decide(name, question), question.scene.whole
-    if effect.called and name in question.scene.refused:  # by the settings: there was nothing to take out of the scene
-        return Effect(name, False, f"forced off, though it is called for: {effect.why}", entry.left(question), True)
-    if effect.called:
-        return effect
-    if name in question.scene.forced:
-        return replace(effect, called=True, why=f"forced on, though {effect.why}", bound=0.0, forced=True)
-    asked = replace(question, scene=whole) if whole else question
-    wished = entry.decide(name, asked)
-    if entry.without and wished.called:
-        return Effect(name, False, f"forced off, though it is called for: {wished.why}", entry.left(asked), True)
+    """What is forced off is judged by the whole scene; no entry's judgement knows what is forced."""
+    scene = question.scene
+    judged = (name in scene.refused and scene.whole) or scene
+    asked = replace(question, scene=replace(judged, forced=(), refused=()) if scene.forced or scene.refused else scene)
+    effect = entry.decide(name, asked)
+    if name in scene.refused and effect.called:
+        return Effect(name, False, f"forced off, though it is called for: {effect.why}", entry.left(asked), True)
+    if name in scene.forced and not (effect.called and effect.bound == 0):
+        why = f"forced on in full: {effect.why}" if effect.called else f"forced on, though {effect.why}"
+        return Effect(name, True, why, 0.0, True)
     return effect
 
 
@@ -173,12 +219,17 @@ def _diffuse_bounces(name: str, question: Question) -> Effect:
     if sees_nothing(question.scene):
         return Effect(name, False, "no surface faces another: the scene is convex seen from outside")
     if bounces >= 0:
-        left = albedo ** (bounces + 1) / (1 - albedo) if albedo < 1 else None
+        glows = any(_brightest(material) for material in question.scene.used_materials)  # with lamps however dim
+        left = albedo ** (bounces + 1) / (1 - albedo) if albedo < 1 and not glows else None
         return Effect(name, bounces > 0, f"forced to {bounces} (largest albedo {albedo:.3g})", left, True)
     why = f'largest albedo {albedo:.3g} ("{brightest.name}"), and surfaces face each other'
     if albedo >= 1:
         return Effect(name, True, f"{why}; where they close it in, light never dies away: lower it", None)
     return Effect(name, True, why)
+
+
+def _gathered(question: Question) -> str:
+    return "as many rays as the noise that is asked for takes, which `ddprt inspect` tries"
 
 
 def _light_kind(kind: str) -> Entry:
@@ -188,7 +239,12 @@ def _light_kind(kind: str) -> Entry:
         why = f"{len(users)} of {len(lightings)} lightings, first {users[0]}" if users else "no lighting has one"
         return Effect(name, bool(users), why)
 
-    return Entry(decide)
+    def cost(question: Question) -> str:
+        count = sum(light.kind == kind for lighting in question.lightings for light in lighting)
+        rays = amount(count * question.direct_samples)
+        return f"up to {rays} shadow rays per texel for all lightings, and more near lamps"
+
+    return Entry(decide, cost=cost)
 
 
 def _material(has: Callable[[Material], object], lacking: str) -> Callable[[str, Question], Effect]:
@@ -244,7 +300,7 @@ def probed(config: Config, scene: Scene) -> bool:
 EFFECTS: Catalogue[Entry] = Catalogue(
     "effect",
     {
-        "diffuse bounces": Entry(_diffuse_bounces),
+        "diffuse bounces": Entry(_diffuse_bounces, cost=_gathered),
         **{f"{kind} lights": _light_kind(kind) for kind in LIGHTS},
         "cut-outs": Entry(_material(pierced, "no material has holes"), "cutouts", _without_cutouts),
         "two-sided sheets": Entry(_two_sided, without=without_backs),
