@@ -42,7 +42,7 @@ def under_suns(data: Dataset) -> Arrays:
         for entry, frame in zip(data.description["lightings"], measured, strict=True)
     ]
     other = Arrays(data.folder, {**data.description, "lightings": entries}, None, measured, data.maps("indirect", every))
-    other.__dict__.update({name: getattr(data, name) for name in ("gbuffer", "covered", "samples", "occluders", "uv")})
+    other.__dict__.update({name: getattr(data, name) for name in ("gbuffer", "covered", "samples", "occluders", "uv", "holes")})
     return other
 
 
