@@ -78,7 +78,8 @@ def validation_error(data: Dataset, config: Config) -> float:
     from ddprt.runtime.train import fit_config
 
     model, held = fit_config(data, config, config.fit.method), data.split("validation")
-    light = model.predict(data.values(held, model.points, config.points.quantity), constant=False)
+    lightings, values = [data.lightings[index] for index in held], data.values(held, model.points, config.points.quantity)
+    light = model.predict(values, lightings=lightings, constant=False)
     truth = Truth(data.maps("indirect", held), data.area)
     error = truth.relative_rmse(light - truth.reference)
     return float("inf") if error is None else error

@@ -187,7 +187,7 @@ def relight(call: Call) -> None:
     for index, lighting in enumerate(lightings):
         path = out if len(lightings) == 1 else out.with_stem(f"{out.stem}_{index:03d}")
         measured = model.measure(lighting)
-        image, trust = model.image(model.predict(measured)), model.trust(measured)
+        image, trust = model.image(model.predict(measured, lightings=lighting)), model.trust(measured)
         if not image.any():
             print(
                 f"warning: lighting {index} lights no measurement point, so {path} is black; its lamps may stand "

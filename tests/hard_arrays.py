@@ -61,6 +61,7 @@ def make_data(measured: np.ndarray, indirect: np.ndarray, area: np.ndarray | Non
     data.__dict__["samples"] = Samples(places, np.tile([0.0, 1.0, 0.0], (points, 1)), np.ones((points, 3)), 0.1)
     data.__dict__["occluders"] = np.zeros((1, 3, 3))
     data.__dict__["uv"] = None
+    data.__dict__["holes"] = None
     return data
 
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+import suns
 from hard_arrays import TEST, TRAIN, VALIDATION, make_data, room
 
-import ddprt
 from ddprt.dataset.store import average_into_points
 from ddprt.methods import METHODS
 from ddprt.report.evaluate import evaluate
@@ -15,7 +15,7 @@ METHOD = pytest.mark.parametrize("method", sorted(METHODS))
 
 
 def status(measured: np.ndarray, indirect: np.ndarray, method: str = "svd-ridge") -> str:
-    return ddprt.fit(make_data(measured, indirect), method, bases=6).relighter.report.status
+    return suns.fit(make_data(measured, indirect), method, bases=6).relighter.report.status
 
 
 @METHOD
@@ -23,7 +23,7 @@ def test_validation_lightings_that_no_point_sees_are_said(method: str) -> None:
     measured, indirect = room()
     assert status(measured, indirect, method) != "blind"
     measured[HELD_BACK] = 0
-    report = ddprt.fit(make_data(measured, indirect), method, bases=6).relighter.report
+    report = suns.fit(make_data(measured, indirect), method, bases=6).relighter.report
     assert "blind" in report.remarks
 
 
@@ -32,7 +32,9 @@ def test_held_out_lightings_that_no_point_sees_are_said(method: str) -> None:
     measured, indirect = room()
     measured[-TEST:] = 0
     data = make_data(measured, indirect)
-    scores = evaluate(data, {method: ddprt.fit(data, method, bases=6)}, {}).metrics["methods"][method]
+    scores = evaluate(suns.under_suns(data), {method: suns.bare(suns.fit(data, method, bases=6))}, {}).metrics["methods"][
+        method
+    ]
     assert "blind" in scores["remarks"]
     assert scores["status"] != "ok"
 
@@ -42,7 +44,7 @@ def test_held_out_lightings_that_no_point_sees_are_said(method: str) -> None:
 def test_validation_in_other_units_than_training_is_not_ok(method: str, factor: float) -> None:
     measured, indirect = room()
     measured[HELD_BACK] *= np.float32(factor)
-    model = ddprt.fit(make_data(measured, indirect), method, bases=6)
+    model = suns.fit(make_data(measured, indirect), method, bases=6)
     assert "worse_than_mean" in model.relighter.report.remarks
     found = model.trust(measured[HELD_BACK])
     assert found is not None

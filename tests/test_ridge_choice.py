@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from suns import sun_of
 
 from ddprt.errors import UserError
 from ddprt.fitting.selection import SECOND_OPINION, TWINS, Choice, choose_ridge, decompose, left_out
@@ -278,7 +279,7 @@ def pairs(measured: np.ndarray, indirect: np.ndarray, channels: str = "mono") ->
     values, light = jnp.asarray(X), jnp.asarray(Y)
     scale = encoding.scale(values)
     places = jnp.zeros((X.shape[1], 3))
-    frame = Frame(encoding.encode(values, scale), places, places)
+    frame = Frame(encoding.encode(values, scale), places, places, [sun_of(row, np.zeros(places.shape)) for row in X])
     unseen = unseen_share(np.asarray(scale), Y)
     area = np.ones(Y.shape[1], np.float32)
     return Examples(frame, encoding.encode(light, scale), scale, area, "area", channels, unseen)

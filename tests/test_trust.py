@@ -9,6 +9,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import suns
 
 import ddprt
 from ddprt.cli import main
@@ -200,7 +201,7 @@ def test_scaling_the_light_otherwise_changes_rounding_alone(model: Model, values
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_has_trust(name: str, data: Dataset, values: np.ndarray, tmp_path: Path) -> None:
     settings = {"mlp": {"steps": 20, "width": 8}}.get(name)
-    model = ddprt.fit(data, name, settings=settings, **({"bases": 6} if name == "svd-ridge" else {}))
+    model = suns.fit(data, name, settings=settings, **({"bases": 6} if name == "svd-ridge" else {}))
     found = model.trust(values)
     assert found is not None
     assert ((found.score >= 0) & (found.score <= 1)).all()

@@ -14,10 +14,12 @@ from ddprt.errors import UserError, nearest
 from ddprt.methods.floors import MeanLightmap, NearestLighting
 from ddprt.methods.method import Method
 from ddprt.methods.mlp import Mlp
+from ddprt.methods.sh_prt import ShPrt
 from ddprt.methods.svd_ridge import SvdRidge
 
 METHODS: Catalogue[type[Method]] = Catalogue(
-    "method", {"svd-ridge": SvdRidge, "mean": MeanLightmap, "nearest": NearestLighting, "mlp": Mlp}
+    "method",
+    {"svd-ridge": SvdRidge, "mean": MeanLightmap, "nearest": NearestLighting, "mlp": Mlp, "sh-prt": ShPrt},
 )
 METHODS.update({point.name: point.load() for point in entry_points(group="ddprt.methods")})
 

@@ -30,13 +30,15 @@ class Frame:
     Attributes:
       values: measured light at the points, scaled and encoded.
       positions, normals: of the points, metres and unit vectors.
-      lightings: the lights themselves, for methods that ask for them.
+      lightings: the lights themselves, of training pairs.
+      described: what a Relighter that `AsksForLights` made of the lights; over the scale of `values`, 0 where that is 0.
     """
 
     values: Float[Array, "frames points 3"]
     positions: Float[Array, "points 3"]
     normals: Float[Array, "points 3"]
     lightings: Sequence[Any] | None = None
+    described: Float[Array, "frames numbers 3"] | None = None
 
 
 @runtime_checkable
@@ -144,10 +146,19 @@ class Relighter(Protocol):
         ...
 
 
+@runtime_checkable
+class AsksForLights(Protocol):
+    """A Relighter that answers from the lights themselves; `Model.predict` then has to be given them."""
+
+    def describe(self, lightings: Sequence[Any]) -> Float[np.ndarray, "lightings numbers 3"]:
+        """Lightings as arrays of one shape, outside of compiled code: linear in the light, W/m² or the like."""
+        ...
+
+
 class Method(BaseModel):
     """Base of the methods' settings records; those that can learn from `Maps` say that they `streams`.
 
-    A Relighter of a method that streams answers without `Frame.lightings`.
+    A Relighter of a method that streams is none that `AsksForLights`. A method with a field `space` fits in that space alone.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)

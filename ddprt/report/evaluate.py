@@ -1,7 +1,7 @@
 """Everything a report says, as data: scores, floors, curves and the check against the reference integrator."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal
@@ -64,9 +64,10 @@ def evaluate(data: Dataset, models: Mapping[str, Model], fit_seconds: Mapping[st
     truth = Truth(data.maps("indirect", test), data.area)
     whole = float(truth.squares.sum())
     predicted, scores, values = {}, {}, np.zeros((0, 0, 3))
+    lightings = [data.lightings[index] for index in test]
     for name, model in models.items():
         values = data.values(test, model.points, model.quantity)
-        unclamped, relight_seconds = _frame_by_frame(model, values)
+        unclamped, relight_seconds = _frame_by_frame(model, values, lightings)
         predicted[name] = np.maximum(unclamped, 0)  # the clamp commutes with decoding, which is odd and rising
         unseen = float(truth.squares[~values.any((1, 2))].sum())
         report = model.relighter.report.noting(*(["blind"] if unseen > BLIND * whole else []))
@@ -248,10 +249,10 @@ def bases_curve(data: Dataset, config: Config, truth: Truth) -> list[tuple[int, 
     has_mean = whole - len(model.relighter.basis)
     if whole == 0:
         return []
-    rows = []
+    lightings, rows = [data.lightings[index] for index in test], []
     for bases in sorted({min(bases, whole) for bases in config.report.bases_curve if bases > has_mean}):
         shorter = replace(model, relighter=model.relighter.truncated(bases - has_mean))
-        error = truth.relative_rmse(np.maximum(_frame_by_frame(shorter, values)[0], 0) - truth.reference)
+        error = truth.relative_rmse(np.maximum(_frame_by_frame(shorter, values, lightings)[0], 0) - truth.reference)
         floor = projection_error(data, model, truth, bases - has_mean)
         if error is not None and floor is not None:
             rows.append((bases, error, floor))
@@ -320,13 +321,13 @@ def _bake_variance(brightness: np.ndarray, noise: np.ndarray) -> np.ndarray:
     return share * brightness
 
 
-def _frame_by_frame(model: Model, values: np.ndarray) -> tuple[np.ndarray, float]:
+def _frame_by_frame(model: Model, values: np.ndarray, lightings: Sequence[Any]) -> tuple[np.ndarray, float]:
     """Unclamped prediction of every frame through the public API, and the median seconds of one, compiled before."""
-    model.predict(values[0], clamp=False, constant=False)
+    model.predict(values[0], lightings=lightings[0], clamp=False, constant=False)
     light, seconds = [], []
-    for frame in values:
+    for frame, lighting in zip(values, lightings, strict=True):
         start = time.perf_counter()
-        light.append(model.predict(frame, clamp=False, constant=False))
+        light.append(model.predict(frame, lightings=lighting, clamp=False, constant=False))
         seconds.append(time.perf_counter() - start)
     return np.stack(light), float(np.median(seconds))
 

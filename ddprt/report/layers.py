@@ -38,9 +38,10 @@ def _scores(data: Dataset, part: LayerModel) -> dict[str, Any]:
         square = sum(np.einsum("ec,ec,e->", row, row, own.area, dtype=np.float64) for row in error) / whole
         return float(np.sqrt(square) / mean) if mean > 0 else None
 
+    lightings = [data.lightings[index] for index in test]
     found: dict[str, Any] = {
         "places": int((layer.weight > 0).sum()),
-        "relative_rmse": share(model.predict(values, clamp=False) - reference),
+        "relative_rmse": share(model.predict(values, lightings=lightings, clamp=False) - reference),
         "noise_relative_rmse": share(own.maps("noise", test)),
     }
     basis = getattr(model.relighter, "basis", None)

@@ -16,7 +16,7 @@ from ddprt.dataset.store import average_into_points
 from ddprt.errors import UserError
 from ddprt.fitting.encoding import Encoding
 from ddprt.lights import Light, Lighting, parse_lighting
-from ddprt.methods.method import Frame, Relighter
+from ddprt.methods.method import AsksForLights, Frame, Relighter
 from ddprt.runtime.coefficients import Coefficients
 from ddprt.runtime.trust import Trust, Yardstick
 from ddprt.sampling.points import Samples
@@ -64,11 +64,20 @@ class Model:
     holes: Holes | None = None
     constant: np.ndarray | None = None
 
-    def predict(self, values: Any, *, clamp: bool | str = True, fade: bool = False, constant: bool = True) -> np.ndarray:
+    def predict(
+        self,
+        values: Any,
+        *,
+        lightings: Any = None,
+        clamp: bool | str = True,
+        fade: bool = False,
+        constant: bool = True,
+    ) -> np.ndarray:
         """Indirect irradiance from measured light, and the light of what glows.
 
         Args:
           values: (points, 3) or (frames, points, 3) measured light in W/m², of `quantity`.
+          lightings: what was measured: a lighting, or one for each frame. Only methods that answer from lights look at it.
           clamp: cut negative light off, as an engine does; "energy": in the way that keeps the total of each frame and channel
             (see `ddprt.fitting.encoding.without_negatives`); False keeps it.
           fade: where trust is low, go over to the mean lightmap, as bright as the measurements are.
@@ -76,7 +85,8 @@ class Model:
         Returns:
           (texels, 3) or (frames, texels, 3) float32, W/m², covered texels in row-major order.
         Raises:
-          UserError: wrong shape, not real numbers, not finite, no such clamp, or nothing to fade by.
+          UserError: wrong shape, not real numbers, not finite, no such clamp, nothing to fade by, or no lightings where the
+            method asks for them.
         """
         frames, single = self._frames(values)
         if not isinstance(clamp, bool | np.bool_ | str) or clamp not in (True, False, "energy"):
@@ -84,7 +94,10 @@ class Model:
         if fade and self.yardstick is None:
             raise UserError("fade: got a model of an older version, which knows no trust; fit it again")
         area = self._shares if clamp == "energy" else None
-        light = np.asarray(_relight(self.relighter, self.encoding, frames, *self._places, bool(clamp), area))
+        told = self._described(lightings, len(frames), single) if isinstance(self.relighter, AsksForLights) else None
+        if fade and told is not None:
+            raise UserError(f"fade: got True for {self.method}, which answers from lights; leave it out, or fit svd-ridge")
+        light = np.asarray(_relight(self.relighter, self.encoding, frames, told, *self._places, bool(clamp), area))
         if fade and self.yardstick is not None:
             kept = self.yardstick.kept(self.yardstick.measure(self.encoding, frames).score)[:, None, None]
             scale = np.asarray(self.encoding.scale(frames), np.float64)[:, None]
@@ -163,7 +176,7 @@ class Model:
         Returns:
           (height, width, 3) float32 irradiance in W/m², row 0 at the top, 0 where nothing is covered.
         """
-        return self.image(self.predict(self.measure(lighting), constant=constant))
+        return self.image(self.predict(self.measure(lighting), lightings=lighting, constant=constant))
 
     def image(self, values: np.ndarray) -> np.ndarray:
         """Values of covered texels as an image."""
@@ -185,6 +198,18 @@ class Model:
         if not np.isfinite(measured).all():
             raise UserError(_NOT_FINITE)
         return jnp.asarray(measured[None] if single else measured), single
+
+    def _described(self, lightings: Any, frames: int, single: bool) -> Float[Array, "frames numbers 3"]:
+        if lightings is None:
+            raise UserError(
+                f"lightings: got none, expected what was measured, since {self.method} answers from lights; "
+                "pass lightings to predict, or use relight"
+            )
+        each = [lightings] if single else list(lightings)
+        if len(each) != frames:
+            raise UserError(f"lightings: got {len(each)}, expected one for each of {frames} frames; pass as many")
+        # One without lights is dark.
+        return jnp.asarray(self.relighter.describe([one and parse_lighting(one) for one in each]), jnp.float32)  # type: ignore[attr-defined]
 
     def _check_shape(self, measured: np.ndarray) -> None:
         if measured.shape[-2:] != (self.points, 3) or measured.ndim not in (2, 3):
@@ -225,22 +250,22 @@ class LayerModel:
     layer: Layer
     model: Model
 
-    def predict(self, values: Any) -> np.ndarray:
+    def predict(self, values: Any, *, lightings: Any = None) -> np.ndarray:
         """Harmonics from measured light.
 
         Args:
-          values: as for `Model.predict`.
+          values, lightings: as for `Model.predict`.
         Returns:
           (places, coefficients, 3) or (frames, places, coefficients, 3) float32, in the layer's quantity.
         Raises:
           UserError: likewise.
         """
-        light = self.model.predict(values, clamp=False)
+        light = self.model.predict(values, lightings=lightings, clamp=False)
         return light.reshape(*light.shape[:-2], *self.model.covered.shape, 3)
 
-    def towards(self, values: Any, directions: Any) -> np.ndarray:
+    def towards(self, values: Any, directions: Any, *, lightings: Any = None) -> np.ndarray:
         """Values of the functions in a direction (3,), or in one for each place (places, 3); never below 0."""
-        return self.layer.towards(self.predict(values), np.asarray(directions, np.float64))
+        return self.layer.towards(self.predict(values, lightings=lightings), np.asarray(directions, np.float64))
 
 
 def _real(values: Any) -> np.ndarray:
@@ -265,11 +290,13 @@ def _relight(
     relighter: Relighter,
     encoding: Encoding,
     values: Float[Array, "frames points 3"],
+    described: Float[Array, "frames numbers 3"] | None,
     positions: Float[Array, "points 3"],
     normals: Float[Array, "points 3"],
     clamp: bool | Array,
     area: Float[Array, " texels"] | None,
 ) -> Float[Array, "frames texels 3"]:
     scale = encoding.scale(values)
-    frame = Frame(encoding.encode(values, scale), positions, normals)
+    told = None if described is None else encoding.encode(described, scale)
+    frame = Frame(encoding.encode(values, scale), positions, normals, described=told)
     return encoding.decode(relighter.predict(frame), scale, clamp=clamp, energy_over=area)

@@ -165,7 +165,7 @@ def load_model(folder: str | Path) -> Model:
             raise ValueError(f"got NaN or infinity in {odd[0]}")
         parts = {entry.name: load_model(folder / "layers" / entry.name) for entry in checked.layers}
         model = _assemble(document, checked, tensors, relighter_type, parts)
-        model.predict(np.zeros((model.points, 3)))
+        model.predict(np.zeros((model.points, 3)), lightings=())
         model.trust(np.zeros((model.points, 3)))
     except UserError:
         raise

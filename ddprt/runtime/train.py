@@ -20,10 +20,9 @@ from ddprt.dataset.pack import Pack
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.fitting.encoding import Encoding
-from ddprt.lights import Lighting
 from ddprt.methods import make_method
 from ddprt.methods.floors import MeanLightmap, MeanMap
-from ddprt.methods.method import Examples, Frame, Maps, Method, Relighter, block_texels, unseen_share
+from ddprt.methods.method import AsksForLights, Examples, Frame, Maps, Method, Relighter, block_texels, unseen_share
 from ddprt.methods.statuses import BLIND
 from ddprt.runtime.model import LayerModel, Model
 from ddprt.runtime.trust import Yardstick, calibrated, make_yardstick, outside
@@ -109,7 +108,7 @@ def fit_method(
         raise UserError(f"points: got {points}, but the dataset has {len(data.samples.position)} samples; bake with more")
     if not data.area.sum() > 0:
         raise UserError("area: got texels of 0 m² alone, expected some surface to light; check the atlas and bake again")
-    encoding = Encoding(config.space, config.gamma, config.channels)
+    encoding = Encoding(getattr(method, "space", config.space), config.gamma, config.channels)
     pack = _streamed(data, method, name, stream)
     train, validation = (examples(data, split, encoding, config, points, quantity, pack) for split in ("train", "validation"))
     relighter = method.fit(train, validation, key=jax.random.key(seeds.number(seed, f"method {name}")))
@@ -177,9 +176,11 @@ def _squares(relighter: Relighter | None, encoding: Encoding, examples: Examples
     if isinstance(light, Maps):
         step = max(1, block_texels(1) // max(light.shape[1], 1))
         parts = [slice(start, start + step) for start in range(0, light.shape[0], step)]
-        lightings = None  # of methods that stream none asks for them
     else:
-        parts, lightings = [slice(None)], None if frame.lightings is None else tuple(frame.lightings)
+        parts = [slice(None)]
+    # Of methods that stream none asks for lights.
+    told = relighter.describe(frame.lightings or ()) if isinstance(relighter, AsksForLights) else None
+    described = None if told is None else jnp.asarray(told, jnp.float32)
     squares, peaks = [], []
     for part in parts:
         truth = light.some(part) if isinstance(light, Maps) else light
@@ -187,14 +188,14 @@ def _squares(relighter: Relighter | None, encoding: Encoding, examples: Examples
         scale = examples.scale if truth is light else examples.scale[part]
         largest = jnp.max(examples.scale, initial=0)
         seen = values, frame.positions, frame.normals
-        found = _squares_of(relighter, encoding, *seen, truth, scale, largest, area, lightings, not examples.signed)
+        found = _squares_of(relighter, encoding, *seen, truth, scale, largest, area, described, not examples.signed)
         squares.append(np.asarray(found[0], np.float64))
         peaks.append(float(found[1]))
     unit = max((peak for peak in peaks if peak > 0), default=1.0)
     return np.concatenate([part * ((peak or 1.0) / unit) ** 2 for part, peak in zip(squares, peaks, strict=True)])
 
 
-@partial(jax.jit, static_argnames=("lightings", "clamp"))
+@partial(jax.jit, static_argnames="clamp")
 def _squares_of(
     relighter: Relighter | None,
     encoding: Encoding,
@@ -205,14 +206,14 @@ def _squares_of(
     scale: Array,
     largest: Array,
     area: Array,
-    lightings: tuple[Lighting, ...] | None,
+    described: Array | None,
     clamp: bool,
 ) -> tuple[Array, Array]:
     """The squares of some lightings in units of the peak of their own, and that peak."""
     relative = scale / jnp.maximum(largest, jnp.finfo(jnp.float32).tiny)
     truth = encoding.decode(indirect, relative, clamp=clamp)
     peak = jnp.max(jnp.abs(truth), initial=0)
-    frame = Frame(values, positions, normals, lightings)
+    frame = Frame(values, positions, normals, described=None if described is None else encoding.encode(described, scale))
     answer = 0.0 if relighter is None else encoding.decode(relighter.predict(frame), relative, clamp=clamp)
     return jnp.einsum("ltc,t->l", ((answer - truth) / jnp.where(peak > 0, peak, 1)) ** 2, area), peak
 

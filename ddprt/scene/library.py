@@ -10,6 +10,7 @@ from ddprt.catalogue import Catalogue
 from ddprt.errors import UserError, nearest
 from ddprt.scene.checks import checked, vertex_normals
 from ddprt.scene.cornell import cornell, cornell_hole
+from ddprt.scene.lion import lion
 from ddprt.scene.material import Cutout, Emission, Gloss, Material
 from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import box, faceted, hollow, icosphere, rectangle
@@ -296,6 +297,7 @@ SCENES: Catalogue[Callable[..., Scene]] = Catalogue(
         "glossy-room": glossy_room,
         "leaves": leaves,
         "neon": neon,
+        "lion": lion,
     },
 )
 

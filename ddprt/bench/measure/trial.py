@@ -246,13 +246,13 @@ def about(setting: Setting) -> dict[str, Any]:
 
 def frame_seconds(model: Model, data: Dataset, repeats: int) -> dict[str, Any]:
     """Seconds of one frame, of many at once, and of the coefficients alone (None for methods that have none)."""
-    measured = data.values(data.split("train"), model.points, model.quantity)
-    many = measured[: min(len(measured), 16)]
-    _, frame = timed(lambda: model.predict(measured[0]), _SHORT * repeats)
-    _, batch = timed(lambda: model.predict(many), repeats)
+    indices = data.split("train")[:16]
+    many, lightings = data.values(indices, model.points, model.quantity), [data.lightings[index] for index in indices]
+    _, frame = timed(lambda: model.predict(many[0], lightings=lightings[0]), _SHORT * repeats)
+    _, batch = timed(lambda: model.predict(many, lightings=lightings), repeats)
     coefficients = None
     if isinstance(model.relighter, LinearTransfer):
-        values = measured[0]
+        values = many[0]
         _, timing = timed(_hundred(lambda: model.coefficients(values)), _SHORT * repeats)
         coefficients = timing.each(100).record()
     return {"frame": frame.record(), "batch": {**batch.record(), "frames": len(many)}, "coefficients": coefficients}

@@ -141,7 +141,7 @@ class Yardstick:
         tallies, perceived, energies, pictures, unseen = [], [], [], [], 0
         for row, index in enumerate(self.held_out):
             truth = self._truth(index)
-            unclamped = model.predict(values[row], clamp=False, constant=False)[None]
+            unclamped = model.predict(values[row], lightings=self.data.lightings[index], clamp=False, constant=False)[None]
             predicted = self._carry(model, np.maximum(unclamped, 0))
             tallies.append(truth.tally(predicted))
             perceived.append(pu21_squares(predicted, truth.reference, truth.weight))
@@ -170,7 +170,8 @@ class Yardstick:
         """
         values, tallies = self.measured(model), []
         for row, index in enumerate(self.held_out):
-            tallies.append(self._truth(index).tally(self._carry(model, model.predict(values[row], constant=False)[None])))
+            predicted = model.predict(values[row], lightings=self.data.lightings[index], constant=False)[None]
+            tallies.append(self._truth(index).tally(self._carry(model, predicted)))
         return Tally.joined(tallies)
 
     @cached_property
@@ -247,7 +248,8 @@ class Yardstick:
             for index, frame in zip(self.path, values, strict=True):
                 truth = self._truth(index)
                 means.append(truth.means)
-                yield (self._carry(model, model.predict(frame, constant=False)[None]) - truth.reference)[0]
+                predicted = model.predict(frame, lightings=self.data.lightings[index], constant=False)[None]
+                yield (self._carry(model, predicted) - truth.reference)[0]
 
         unsteady = jitter(differences(), self.data.area / self.data.area.sum())
         mean = float(np.mean(means))
