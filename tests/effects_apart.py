@@ -27,8 +27,9 @@ JOB: dict[str, Any] = {
     "points": {"count": 4, "supersample": 1},
     "transport": {"samples": 8, "test_samples": 8, "threads": 2},
 }
-AROUND = ("statue", "convex")
-SMALL = {"statue": {"subdivisions": 2}, "furnace": {"subdivisions": 2}}
+AROUND = ("statue", "convex", "lion")
+SMALL = {"statue": {"subdivisions": 2}, "furnace": {"subdivisions": 2}, "lion": {"cells": 36}}
+RESOLUTIONS = {"lion": 128}  # of a body in many charts
 ROOM = "ddprt.transport."
 
 
@@ -56,7 +57,8 @@ def baked(name: str, absent: Absent, apart: bool) -> dict[str, Any]:
     scene = build(name, **SMALL.get(name, {}))
     for distribution in ("around",) if name in AROUND else ("room", "around"):
         lightings = {"train": 2, "validation": 1, "test": 1, "distribution": distribution, "clearance": 0.02}
-        config = checked({**JOB, "lightings": lightings})
+        resolution = RESOLUTIONS.get(name, JOB["atlas"]["resolution"])
+        config = checked({**JOB, "atlas": {"resolution": resolution}, "lightings": lightings})
         called = {entry.module for key, entry in EFFECTS.items() if plan(scene, ()).called(key)}
         modules = {ROOM + entry.module for entry in EFFECTS.values() if entry.module and entry.module not in called}
         absent.modules = frozenset(modules if apart else ())

@@ -598,26 +598,23 @@ def test_doubtful_lightings_reach_a_quiet_caller(cornell: Scene) -> None:
         bake(cornell, given, config=small())
 
 
-@pytest.mark.parametrize("near", [0.0, 3.0])
-def test_the_seconds_that_were_expected_are_those_it_takes(
-    near: float, cornell: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A clock that only rays and bounces move: a ray costs 1 ms, `near` ms more where it may meet near senders."""
+def test_the_seconds_that_were_expected_are_those_it_takes(cornell: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A clock that only rays and bounces move: a ray costs 1 ms. What near senders cost is looked at in test_forecast.py."""
     from ddprt.transport.operator import Operator
 
     now = 0.0
     gather, some, bounce = Operator.gather, Operator.gather_some, Operator.bounce
 
-    def costs(rays: int, address: dict) -> None:
+    def costs(rays: int) -> None:
         nonlocal now
-        now += rays * (1 + (near if address.get("near") else 0)) / 1000
+        now += rays / 1000
 
     def gathered(self: Operator, radiosity: np.ndarray, out: np.ndarray, rays: np.ndarray, **address: object):
         yield from gather(self, radiosity, out, rays, **address)
-        costs(int(rays.sum()), address)
+        costs(int(rays.sum()))
 
     def some_gathered(self: Operator, radiosity: np.ndarray, texels: np.ndarray, samples: int, **address: object) -> np.ndarray:
-        costs(len(texels) * samples, address)
+        costs(len(texels) * samples)
         return some(self, radiosity, texels, samples, **address)
 
     def bounced(self: Operator, *given: object, **address: object) -> object:

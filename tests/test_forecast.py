@@ -222,7 +222,7 @@ def test_a_stage_expects_what_its_files_take(monkeypatch: pytest.MonkeyPatch, tm
 
     for room in ("indirect", "sampled"):
         costs(f"ddprt.dataset.{room}.write_map", 8.0)
-    for room in ("sampled", "store"):
+    for room in ("sampled", "manifest"):
         costs(f"ddprt.dataset.{room}.sha256", 3.0)
     progress = Progress(quiet=True)
     bake(ddprt.load_scene("plates"), config=config_of(transport={"threads": 1}), out=tmp_path / "data", progress=progress)

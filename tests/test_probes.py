@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import ddprt
+from ddprt import seeds
 from ddprt.config import Config, checked
 from ddprt.dataset.grids import ProbeGrid, nearest_valid
 from ddprt.dataset.layers import Layer, read_layer, read_light
@@ -31,6 +32,7 @@ from ddprt.transport import probes
 from ddprt.transport.direct import Texels
 from ddprt.transport.effects import plan
 from ddprt.transport.embree import Tracer
+from ddprt.transport.openness import build_open_atlas
 from ddprt.transport.operator import Operator
 
 DOCS = Path(__file__).parent.parent / "docs" / "effects.md"
@@ -85,7 +87,15 @@ def test_a_lit_square_seen_from_above() -> None:
     shown = Progress(quiet=True)
     data = baked(scene, config, [sun] * 10, [at.tolist()], progress=shown)
     traced = [stage["rays"] for stage in shown.stages if str(stage["name"]).startswith("probes")]
-    assert traced == [RAYS, 2 * RAYS]  # none between surfaces that do not face each other
+    tracer = Tracer.of(scene)
+    atlas, _ = build_open_atlas(tracer, scene, 24, config.atlas.padding)
+    opened = tracer.rays
+    Texels.of(tracer, atlas, config.transport.direct_samples, seeds.stream(0, "texel positions", 1)).irradiance(
+        sun, seeds.stream(0, "direct", 0)
+    )
+    shadow = len(data.split("test")) * (tracer.rays - opened)
+    # None between surfaces that do not face each other; the second half of held-out maps has direct light of its own.
+    assert traced == [RAYS, 2 * RAYS + shadow]
     assert not data.maps("indirect", [0]).any()
     layer = read_layer(data, "probes")
     found = read_light(data, layer, [0])[0, 0]

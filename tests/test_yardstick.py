@@ -95,7 +95,7 @@ def test_the_second_time_it_is_there(cornell: Scene, folder: Path, yardstick: Ya
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({}, {"integrator": "operator", "test_samples": "auto"}),
+        ({}, {"integrator": "auto", "test_samples": "auto"}),
         ({"transport__integrator": "paths"}, {"integrator": "paths", "test_samples": "auto"}),
         ({"transport__integrator": "reference"}, {"integrator": "reference", "test_samples": 32}),
         ({"atlas__resolution": "64"}, {"resolution": 64}),

@@ -129,7 +129,11 @@ class MeshLight(LightModel):
         return Shape.of(self.scale * corners @ _matrix(self.rotation).T)
 
     def illuminate(
-        self, points: Float[np.ndarray, "n 3"], u: Float[np.ndarray, "n 2"], out: Illumination | None = None
+        self,
+        points: Float[np.ndarray, "n 3"],
+        u: Float[np.ndarray, "n 2"],
+        out: Illumination | None = None,
+        normals: Float[np.ndarray, "n 3"] | None = None,
     ) -> Illumination:
         """See `Light`."""
         out = out or Illumination.at(points)

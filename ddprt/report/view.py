@@ -66,7 +66,8 @@ class Camera:
 
 _CORNELL = Camera((0.278, 0.273, -0.8), (0.278, 0.273, 0.0), 39.3, 1.0)  # as photographed in Cornell
 _STATUE = Camera((1.5, 1.9, 3.4), (0.0, 0.75, 0.0))
-_CAMERAS = {"cornell": _CORNELL, "cornell-hole": _CORNELL, "statue": _STATUE}
+_LION = Camera((1.5, 0.95, 1.25), (0.0, 0.36, 0.0))  # from its flank, which is what fills a picture
+_CAMERAS = {"cornell": _CORNELL, "cornell-hole": _CORNELL, "statue": _STATUE, "lion": _LION}
 
 
 def default_camera(scene: Scene) -> Camera:

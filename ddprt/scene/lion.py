@@ -31,12 +31,13 @@ def lion(*, length: float = 1.2, cells: int = 72) -> Scene:
     # Rounded: roots and exponentials differ in their last bit from machine to machine.
     positions = np.round(positions * length / 1.2, 9)
     positions[:, 1] -= positions[:, 1].min()
+    positions, triangles, normals = _shaded(positions, triangles)
     stone = positions[triangles][:, :, 1].mean(1) < 0.07 * length
     return checked(
         "lion",
         positions,
         triangles,
-        normals=vertex_normals(positions, triangles),
+        normals=normals,
         material=stone.astype(int),
         materials=(Material("fur", (0.72, 0.55, 0.35)), Material("plinth", (0.62, 0.62, 0.6))),
     )
@@ -121,3 +122,17 @@ def _surface(
         quads.append(np.where(outward[:, None], quad, quad[:, ::-1]))
     corners = np.concatenate(quads)
     return sums[used] / crossings[used][:, None], corners[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
+
+
+def _shaded(positions: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Positions, triangles and normals; where sheets touch along an edge, triangles that face elsewhere are flat."""
+    normals = vertex_normals(positions, triangles)
+    a, b, c = np.moveaxis(positions[triangles], 1, 0)
+    face = np.cross(b - a, c - a)
+    face /= np.linalg.norm(face, axis=1, keepdims=True)
+    flat = (np.einsum("tcd,td->tc", normals[triangles], face) <= 0.5).any(1)
+    own = len(positions) + np.arange(3 * np.count_nonzero(flat)).reshape(-1, 3)
+    positions = np.concatenate([positions, positions[triangles[flat]].reshape(-1, 3)])
+    triangles = triangles.copy()
+    triangles[flat] = own
+    return positions, triangles, np.concatenate([normals, np.repeat(face[flat], 3, axis=0)])
