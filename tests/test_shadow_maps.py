@@ -5,7 +5,9 @@ import pytest
 
 from ddprt.bench.budget.shadow_maps import ShadowMap, engine_irradiance
 from ddprt.lights import parse_lighting
+from ddprt.scene.library import build
 from ddprt.scene.mesh import Scene
+from ddprt.scene.shapes import box
 from ddprt.transport.embree import Tracer
 from ddprt.transport.measure import measure
 
@@ -142,3 +144,15 @@ def test_large_lamps_cast_hard_shadows() -> None:
     in_between = (exact > 0.1 * exact.max()) & (exact < 0.4 * exact.max())
     assert in_between.any()
     assert (ours == 0).mean() > (exact == 0).mean()
+
+
+def test_a_mesh_is_asked_for_its_light_all_over() -> None:
+    """A closed lamp shines to all sides; asked at one spot of one triangle it would be dark from three of these four."""
+    scene = build("plates", size=10.0, distance=20.0)
+    quads = box(np.array([-0.1, 9.9, -0.1]), np.array([0.1, 10.1, 0.1]))
+    triangles = quads[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3).tolist()
+    lamp = parse_lighting({"type": "mesh", "mesh": triangles, "position": [0, 0, 0], "radiance": [1, 1, 1]})
+    at = np.array([[0.0, 6.0, 0.0], [0.0, 14.0, 0.0], [4.0, 10.0, 0.0], [-4.0, 10.0, 0.0]])
+    facing = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    found = engine_irradiance(Tracer.of(scene), lamp, at, facing, resolution=64, taps=1, depth=0.0)
+    assert (found > 0).all()
