@@ -159,7 +159,7 @@ def write_tensors(path: Path, tensors: dict[str, np.ndarray]) -> None:
     """Writes arrays as safetensors, whole."""
     from safetensors.numpy import save
 
-    data = save({name: np.ascontiguousarray(array) for name, array in tensors.items()})
+    data = save({name: np.asarray(array, order="C") for name, array in tensors.items()})
     with written_whole(path) as temporary:
         temporary.write_bytes(data)
 

@@ -74,6 +74,7 @@ class Stage:
         self.facts: dict[str, float | int | str] = {}
         self.seconds = 0.0
         self._live: Any = None
+        self._words = ""
         self._quiet = quiet
         self._spoken = self._start = self._paced = time.perf_counter()
         self._made = self._shown = 0  # steps that took time since `_paced`; steps that the terminal shows
@@ -118,7 +119,14 @@ class Stage:
             rate = (self._spoken - self._paced) / self._made if self._made else 0.0
             left = f", about {rate * (self.total - self.done):.0f} s left" if rate and self.total else ""
             counts = f"{amount(self.done)} of {amount(self.total)}"
-            print(f"{self.name}: {counts} after {self._spoken - self._start:.0f} s{left}", file=sys.stderr, flush=True)
+            words = f", {self._words}" if self._words else ""
+            print(f"{self.name}: {counts} after {self._spoken - self._start:.0f} s{left}{words}", file=sys.stderr, flush=True)
+
+    def tell(self, words: str) -> None:
+        """How things stand, in place of the stage's name on a terminal and after it elsewhere, with the next line."""
+        self._words = words
+        if self._live is not None:
+            self._live.update(self._task, description=words)
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.seconds = time.perf_counter() - self._start

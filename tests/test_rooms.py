@@ -18,6 +18,7 @@ WALK = [
     "transport",
     "dataset",
     "fitting",
+    "training",
     "methods",
     "runtime",
     "report",
@@ -103,7 +104,7 @@ def test_each_heavy_library_has_its_door() -> None:
     assert doors("pyoidn") == {"dataset/denoise.py"}
     assert doors("numba") == {"compiled.py"}
     assert doors("flip_evaluator") == {"report/perceived.py"}
-    assert doors("optax") == {"methods/mlp.py"}
+    assert doors("optax") == {"training/loop.py", "training/schedule.py"}
     assert {Path(name).parts[0] for name in doors("matplotlib")} == {"report"}
 
 

@@ -1,0 +1,100 @@
+"""What learned methods share: how they are trained, and coefficients of a basis as what is to be learned."""
+
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+from pydantic import Field
+
+from ddprt.methods.method import Examples, Method
+from ddprt.training.loop import Problem, Trained, train
+from ddprt.training.schedule import Schedule
+
+Layers = tuple[tuple[Float[Array, "_ _"], Float[Array, " _"]], ...]
+
+
+class Learned(Method):
+    """A method that is trained: how long and how fast, see `Schedule`."""
+
+    steps: int = Field(2000, ge=1)
+    learning_rate: float = Field(2e-3, gt=0)
+    weight_decay: float = Field(1e-4, ge=0)
+    warmup: float = Field(0.0, ge=0, lt=1)
+    check_every: int = Field(50, ge=1)
+    patience: int = Field(0, ge=0)
+    precision: Literal["float32", "bfloat16"] = "float32"
+
+    @property
+    def schedule(self) -> Schedule:
+        """The settings that training knows."""
+        return Schedule(**{name: getattr(self, name) for name in Schedule.model_fields if name in type(self).model_fields})
+
+    def trained(self, name: str, problem: Problem, data: Any, held: Any, key: Array) -> Trained:
+        """Trains by the method's own schedule."""
+        return train(name, problem, data, held, self.schedule, key)
+
+
+def losses(trained: Trained) -> tuple[tuple[int, float, float], ...]:
+    """For `FitReport.loss`."""
+    return tuple((entry.step, entry.loss, entry.validation) for entry in trained.history)
+
+
+def statuses(trained: Trained) -> tuple[str, ...]:
+    """For `FitReport.noting`."""
+    return ("diverged",) if trained.trouble else ()
+
+
+def dense_layers(sizes: list[int], key: Array) -> Layers:
+    """He-normal weights, zero biases."""
+    keys = jax.random.split(key, len(sizes) - 1)
+    start = jax.nn.initializers.he_normal()
+    return tuple((start(k, (a, b), jnp.float32), jnp.zeros(b)) for k, a, b in zip(keys, sizes[:-1], sizes[1:], strict=True))
+
+
+class Seen(NamedTuple):
+    """Measurements and the coefficients that they should give.
+
+    Attributes:
+      inputs: scaled and encoded measurements.
+      targets: coefficients, over `size`.
+      importance: of each lighting and group, mean 1: its share in squared errors of light.
+      size: what targets were divided by.
+    """
+
+    inputs: Float[Array, "lightings groups inputs"]
+    targets: Float[Array, "lightings groups bases"]
+    importance: Float[Array, "lightings groups"]
+    size: Float[Array, " bases"]
+
+    @classmethod
+    def of(cls, examples: Examples, groups: int, vectors: Array, entries: Array) -> "Seen":
+        """Projections of all light on basis vectors."""
+        return _seen(groups, examples.frame.values, examples.indirect, examples.scale, vectors, entries)
+
+    @property
+    def spread(self) -> Float[Array, " bases"]:
+        """Root of the mean square of each coefficient, without squares that leave the range of float32."""
+        peak = jnp.maximum(jnp.max(jnp.abs(self.targets), (0, 1)), 1e-12)
+        return jnp.maximum(peak * jnp.sqrt(jnp.mean((self.targets / peak) ** 2, (0, 1))), 1e-12)
+
+    def over(self, size: Float[Array, " bases"]) -> "Seen":
+        """With targets of about 1."""
+        return self._replace(targets=self.targets / size, size=size)
+
+    def error(self, found: Float[Array, "lightings groups bases"]) -> Float[Array, ""]:
+        """Mean squared error of light where `found` are targets, in units of the training light's."""
+        relative = self.size / jnp.max(self.size)  # of lightings that hardly any point sees, squares could pass float32's range
+        share = relative**2 / jnp.sum(relative**2)
+        return jnp.mean(self.importance[..., None] * share * (found.astype(jnp.float32) - self.targets) ** 2)
+
+
+@partial(jax.jit, static_argnums=0)
+def _seen(groups: int, values: Array, light: Array, scale: Array, vectors: Array, entries: Array) -> Seen:
+    inputs = jnp.moveaxis(values, 2, 1) if groups == 3 else values.reshape(len(values), 1, -1)
+    rows = jnp.moveaxis(light, 2, 1) if groups == 3 else light.reshape(len(light), 1, -1)
+    targets = jnp.matmul(rows * entries, vectors.T, precision="highest")
+    share = (scale[:, :groups] / jnp.maximum(jnp.max(scale), jnp.finfo(jnp.float32).tiny)) ** 2
+    importance = share / jnp.maximum(jnp.mean(share), jnp.finfo(jnp.float32).tiny)
+    return Seen(inputs, targets, importance, jnp.ones(len(vectors)))

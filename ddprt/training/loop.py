@@ -1,0 +1,142 @@
+"""The training loop.
+
+All steps between two looks at the validation data are one compiled call, which equal problems share: rates, decay and the
+number of steps are data to it, so that a search over them compiles once. A step's randomness follows from the key and its
+number alone: whoever goes on from a checkpoint goes the very way of whoever was never stopped.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float, Int
+
+from ddprt.training.journal import Entry, journal
+from ddprt.training.schedule import Schedule, moments, rate
+
+Tree = Any
+
+
+@runtime_checkable
+class Problem(Protocol):
+    """What is trained. Hashable: equal problems share what is compiled. Products take place in the type of the parameters."""
+
+    def initial(self, data: Tree, key: Array) -> Tree:
+        """Parameters to start from."""
+        ...
+
+    def loss(self, parameters: Tree, data: Tree, key: Array) -> Float[Array, ""]:
+        """What a step lowers, float32; `key` draws its batch."""
+        ...
+
+    def check(self, parameters: Tree, held: Tree) -> Float[Array, ""]:
+        """What the best parameters are chosen by: the loss of all validation data, float32."""
+        ...
+
+
+class State(NamedTuple):
+    """Everything that training goes on from."""
+
+    step: Int[Array, ""]
+    parameters: Tree
+    memory: Tree
+    best: Tree
+    lowest: Float[Array, ""]
+    waited: Int[Array, ""]
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What came of it.
+
+    Attributes:
+      parameters: the best on the validation data; those at the start where none was finite.
+      history: a look at the validation data each.
+      trouble: what went wrong, in words; empty where nothing did.
+    """
+
+    parameters: Tree
+    history: tuple[Entry, ...]
+    trouble: str = ""
+
+
+def train(
+    name: str, problem: Problem, data: Tree | Callable[[int], Tree], held: Tree, schedule: Schedule, key: Array
+) -> Trained:
+    """Trains to the end of the schedule, until nothing gets better, or until numbers are not finite.
+
+    Args:
+      name: of the method, for the journal.
+      problem: what is trained.
+      data: arrays; or a function from the number of a round to the arrays of that round, where they do not fit into memory.
+      held: validation data.
+      schedule: how long and how fast.
+      key: the only randomness.
+    """
+    of_round = data if callable(data) else lambda _: data
+    start_key, step_key = jax.random.split(key)
+    first = of_round(0)
+    with journal(name, problem, schedule, key, (first, held)) as log:
+        state, history = log.resumed(_begin(problem, first, start_key))
+        trouble = ""
+        for number in range(len(history), schedule.rounds):
+            if schedule.patience and int(state.waited) >= schedule.patience:
+                break
+            state, seen = _round(
+                problem, schedule.round, schedule.dtype, schedule.numbers, state, of_round(number), held, step_key
+            )
+            entry = Entry(int(state.step), *map(float, np.asarray(seen)))
+            history.append(entry)
+            trouble = _trouble(entry)
+            log.add(entry, state, history)
+            if trouble:
+                break
+    return Trained(state.best, tuple(history), trouble)
+
+
+def _trouble(entry: Entry) -> str:
+    if np.isfinite((entry.loss, entry.validation, entry.gradient)).all():
+        return ""
+    what = "the loss" if not np.isfinite(entry.loss) else "the gradient" if not np.isfinite(entry.gradient) else "the check"
+    return f"{what} was not finite by step {entry.step}, at a learning rate of {entry.rate:.3g}"
+
+
+@partial(jax.jit, static_argnums=0)
+def _begin(problem: Problem, data: Tree, key: Array) -> State:
+    parameters = problem.initial(data, key)
+    zero = jnp.zeros((), jnp.int32)
+    return State(zero, parameters, moments().init(parameters), parameters, jnp.array(jnp.inf, jnp.float32), zero)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _round(
+    problem: Problem, steps: int, dtype: jnp.dtype, numbers: Array, state: State, data: Tree, held: Tree, key: Array
+) -> tuple[State, Float[Array, " 4"]]:
+    """Some steps and a look; of the last step: loss, then the check, the gradient's norm and the rate."""
+    adam = moments()
+
+    def loss(parameters: Tree, key: Array) -> Array:
+        return problem.loss(jax.tree.map(lambda leaf: leaf.astype(dtype), parameters), data, key)
+
+    def step(carry: tuple[Array, Tree, Tree], _: None) -> tuple[tuple[Array, Tree, Tree], Float[Array, " 2"]]:
+        count, parameters, memory = carry
+        value, gradient = jax.value_and_grad(loss)(parameters, jax.random.fold_in(key, count))
+        norm = optax.tree.norm(gradient)
+        gradient = jax.tree.map(lambda leaf: leaf * jnp.minimum(1, numbers[3] / jnp.maximum(norm, 1e-30)), gradient)
+        updates, memory = adam.update(gradient, memory)
+        pace, decay = rate(numbers, count), numbers[1]
+        parameters = jax.tree.map(lambda leaf, update: leaf - pace * (update + decay * leaf), parameters, updates)
+        return (count + 1, parameters, memory), jnp.stack([value, norm])
+
+    (count, parameters, memory), seen = jax.lax.scan(step, (state.step, state.parameters, state.memory), None, length=steps)
+    now = problem.check(parameters, held)
+    better = now < state.lowest  # never of NaN: parameters that are not finite are not kept
+    best = jax.tree.map(lambda a, b: jnp.where(better, a, b), parameters, state.best)
+    waited = jnp.where(better, 0, state.waited + 1)
+    after = State(count, parameters, memory, best, jnp.where(better, now, state.lowest), waited)
+    return after, jnp.stack([seen[:, 0].mean(), now, seen[-1, 1], rate(numbers, count - 1)])
