@@ -37,7 +37,8 @@ class Basis:
       vectors: U, float32; the entry of largest magnitude of each is positive.
       mean: subtracted from every column before, zero where nothing was.
       coefficients: of the training columns, float64.
-      singular_values: of the weighted data, all of them, falling, float64; to 1 % down to `RANK_CUT` times the largest.
+      singular_values: of the weighted data, falling, float64; to 1 % down to `RANK_CUT` times the largest. All of them, or
+        where learning found the basis those within it.
       rank: numerical rank of the data.
       status: "ok"; "rank_deficient": fewer vectors than asked for, since the data has no more; "no_signal": no light at all.
     """
@@ -45,7 +46,7 @@ class Basis:
     vectors: Float[Array, "bases entries"]
     mean: Float[Array, " entries"]
     coefficients: Float[Array, "columns bases"]
-    singular_values: Float[Array, " columns"]
+    singular_values: Float[Array, " values"]
     rank: int
     status: Status
 

@@ -11,6 +11,7 @@ from pydantic import ValidationError
 
 from ddprt.catalogue import Catalogue
 from ddprt.errors import UserError, nearest
+from ddprt.methods.autoencoder import Autoencoder
 from ddprt.methods.floors import MeanLightmap, NearestLighting
 from ddprt.methods.method import Method
 from ddprt.methods.mlp import Mlp
@@ -19,7 +20,14 @@ from ddprt.methods.svd_ridge import SvdRidge
 
 METHODS: Catalogue[type[Method]] = Catalogue(
     "method",
-    {"svd-ridge": SvdRidge, "mean": MeanLightmap, "nearest": NearestLighting, "mlp": Mlp, "sh-prt": ShPrt},
+    {
+        "svd-ridge": SvdRidge,
+        "mean": MeanLightmap,
+        "nearest": NearestLighting,
+        "mlp": Mlp,
+        "autoencoder": Autoencoder,
+        "sh-prt": ShPrt,
+    },
 )
 METHODS.update({point.name: point.load() for point in entry_points(group="ddprt.methods")})
 

@@ -18,10 +18,13 @@ from pydantic import Field
 from scipy.spatial.distance import cdist
 
 from ddprt.errors import UserError
-from ddprt.fitting.basis import entry_weights, fit_basis
+from ddprt.fitting.basis import Basis, entry_weights, fit_basis
 from ddprt.fitting.selection import Spectrum, choose_ridge, decompose
 from ddprt.fitting.transfer import point_stretch, solve_transfer
 from ddprt.methods.method import Examples, FitReport, Frame, Method, array_bytes, as_pytree, columns, found_in, measured
+
+Ridge = Literal["auto"] | float | tuple[float, ...]
+"""In units of scaled measured²; one per measurement, or "auto"."""
 
 _ADDED_UP = 16  # bases up to which a sum is faster than a product of matrices
 
@@ -92,7 +95,7 @@ class SvdRidge(Method):
     bases: int = Field(16, ge=1)
     centre: Literal["none", "mean"] = "none"
     ridge: Literal["auto"] | Annotated[float, Field(ge=0)] | tuple[Annotated[float, Field(ge=0)], ...] = "auto"
-    smooth: float = Field(0, ge=0, description="reach over which points act alike, in distances between points; 0: off")
+    smooth: float = Field(0.0, ge=0, description="reach over which points act alike, in distances between points; 0: off")
 
     def fit(self, train: Examples, validation: Examples, *, key: Array) -> LinearTransfer:
         """See `Method`; neither `validation` nor `key` is used.
@@ -111,48 +114,63 @@ class SvdRidge(Method):
         entries = jnp.asarray(entry_weights(train.area, train.weights, train.channels))  # type: ignore[arg-type]
         centre = self.centre == "mean"
         basis = fit_basis(rows, entries, bases=self.bases - centre, centre=centre)
-        per_group = _spread(basis.coefficients, train, basis.vectors.shape[0])
-        seen = measured(train) if basis.rank else []
-        inputs = train.frame.values.shape[1] * (1 if train.channels == "mono" else 3)
-        stretch = point_stretch(self.ridge, inputs)
-        parts = [(part.values, jnp.asarray(per_group[part.group][part.rows])) for part in seen]
-        if self.smooth:
-            root = likeness_root(train.frame, self.smooth)
-            root = root if train.channels == "mono" else np.kron(root, np.eye(3))
-            spectra = [_smoothed(X, C, root, intercept=centre) for X, C in parts]
-        else:
-            spectra = [decompose(X, C, stretch=stretch, intercept=centre) for X, C in parts]
-        weight = [part.importance for part in seen]
-        choice = choose_ridge(spectra, weight, [part.rows for part in seen]) if self.ridge == "auto" and seen else None
-        ridge = choice.ridge if choice else self.ridge
-        solved = [solve_transfer(spectrum, ridge, stretch, w) for spectrum, w in zip(spectra, weight, strict=True)]  # type: ignore[arg-type]
-        fitted = {part.group: transfer for part, transfer in zip(seen, solved, strict=True)}
-        shape = (basis.vectors.shape[0], inputs)
-        stack = lambda pick, size: jnp.stack(  # noqa: E731
-            [pick(fitted[g]) if g in fitted else jnp.zeros(size) for g in range(len(per_group))]
-        )
-        report = FitReport(
-            bases=int(shape[0]) + centre,
-            numerical_rank=basis.rank,
-            condition=tuple(t.condition for t in solved),
-            ranks=tuple(t.rank for t in solved),
-            ridge=tuple(t.ridge for t in solved),
-            ridge_chosen_by="loo" if self.ridge == "auto" else "given",
-            ridge_second=(choice.second,) * len(solved) if choice else (),
-            leave_one_out=tuple(t.leave_one_out for t in solved),
-            singular_values=tuple(np.asarray(basis.singular_values).tolist()),
-            ridge_path=tuple(tuple(zip(choice.path[:, 0].tolist(), own.tolist(), strict=True)) for own in choice.own)
-            if choice
-            else ((),) * len(solved),
-        ).noting(*found_in(train), basis.status, *(r for t in solved for r in t.remarks), *(choice.remarks if choice else ()))
-        return LinearTransfer(
-            stack(lambda t: t.matrix, shape),
-            stack(lambda t: t.offset, shape[1]),
-            stack(lambda t: t.intercept, shape[0]),
-            basis.vectors,
-            basis.mean,
-            report,
-        )
+        return transfer_to(basis, train, self.ridge, centre=centre, smooth=self.smooth)
+
+
+def transfer_to(
+    basis: Basis, train: Examples, ridge: Ridge = "auto", *, centre: bool = False, smooth: float = 0.0
+) -> LinearTransfer:
+    """The ridge transfer from measurements to coefficients of a basis.
+
+    Args:
+      basis: of the training columns, orthonormal under the entries' weights.
+      train: pairs to learn from.
+      ridge: "auto" chooses by leaving one lighting out.
+      centre: whether the basis has a mean, so that measurements have one too.
+      smooth: see `SvdRidge`.
+    """
+    per_group = _spread(basis.coefficients, train, basis.vectors.shape[0])
+    seen = measured(train) if basis.rank else []
+    inputs = train.frame.values.shape[1] * (1 if train.channels == "mono" else 3)
+    stretch = point_stretch(ridge, inputs)
+    parts = [(part.values, jnp.asarray(per_group[part.group][part.rows])) for part in seen]
+    if smooth:
+        root = likeness_root(train.frame, smooth)
+        root = root if train.channels == "mono" else np.kron(root, np.eye(3))
+        spectra = [_smoothed(X, C, root, intercept=centre) for X, C in parts]
+    else:
+        spectra = [decompose(X, C, stretch=stretch, intercept=centre) for X, C in parts]
+    weight = [part.importance for part in seen]
+    choice = choose_ridge(spectra, weight, [part.rows for part in seen]) if ridge == "auto" and seen else None
+    chosen = choice.ridge if choice else ridge
+    solved = [solve_transfer(spectrum, chosen, stretch, w) for spectrum, w in zip(spectra, weight, strict=True)]  # type: ignore[arg-type]
+    fitted = {part.group: transfer for part, transfer in zip(seen, solved, strict=True)}
+    shape = (basis.vectors.shape[0], inputs)
+    stack = lambda pick, size: jnp.stack(  # noqa: E731
+        [pick(fitted[g]) if g in fitted else jnp.zeros(size) for g in range(len(per_group))]
+    )
+    report = FitReport(
+        bases=int(shape[0]) + centre,
+        numerical_rank=basis.rank,
+        condition=tuple(t.condition for t in solved),
+        ranks=tuple(t.rank for t in solved),
+        ridge=tuple(t.ridge for t in solved),
+        ridge_chosen_by="loo" if ridge == "auto" else "given",
+        ridge_second=(choice.second,) * len(solved) if choice else (),
+        leave_one_out=tuple(t.leave_one_out for t in solved),
+        singular_values=tuple(np.asarray(basis.singular_values).tolist()),
+        ridge_path=tuple(tuple(zip(choice.path[:, 0].tolist(), own.tolist(), strict=True)) for own in choice.own)
+        if choice
+        else ((),) * len(solved),
+    ).noting(*found_in(train), basis.status, *(r for t in solved for r in t.remarks), *(choice.remarks if choice else ()))
+    return LinearTransfer(
+        stack(lambda t: t.matrix, shape),
+        stack(lambda t: t.offset, shape[1]),
+        stack(lambda t: t.intercept, shape[0]),
+        basis.vectors,
+        basis.mean,
+        report,
+    )
 
 
 def likeness_root(frame: Frame, smooth: float) -> Float[np.ndarray, "points points"]:

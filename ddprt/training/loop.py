@@ -17,7 +17,7 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from ddprt.training.journal import Entry, journal
-from ddprt.training.schedule import Schedule, moments, rate
+from ddprt.training.schedule import Schedule, memory, rate
 
 Tree = Any
 
@@ -82,14 +82,12 @@ def train(
     start_key, step_key = jax.random.split(key)
     first = of_round(0)
     with journal(name, problem, schedule, key, (first, held)) as log:
-        state, history = log.resumed(_begin(problem, first, start_key))
-        trouble = ""
+        state, history = log.resumed(_begin(problem, schedule.by, first, start_key))
+        trouble, how = "", _How(schedule.round, schedule.dtype, schedule.by)
         for number in range(len(history), schedule.rounds):
             if schedule.patience and int(state.waited) >= schedule.patience:
                 break
-            state, seen = _round(
-                problem, schedule.round, schedule.dtype, schedule.numbers, state, of_round(number), held, step_key
-            )
+            state, seen = _round(problem, how, schedule.numbers, state, of_round(number), held, step_key)
             entry = Entry(int(state.step), *map(float, np.asarray(seen)))
             history.append(entry)
             trouble = _trouble(entry)
@@ -106,37 +104,63 @@ def _trouble(entry: Entry) -> str:
     return f"{what} was not finite by step {entry.step}, at a learning rate of {entry.rate:.3g}"
 
 
-@partial(jax.jit, static_argnums=0)
-def _begin(problem: Problem, data: Tree, key: Array) -> State:
+@partial(jax.jit, static_argnums=(0, 1))
+def _begin(problem: Problem, by: str, data: Tree, key: Array) -> State:
     parameters = problem.initial(data, key)
     zero = jnp.zeros((), jnp.int32)
-    return State(zero, parameters, moments().init(parameters), parameters, jnp.array(jnp.inf, jnp.float32), zero)
+    return State(zero, parameters, memory(by).init(parameters), parameters, jnp.array(jnp.inf, jnp.float32), zero)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
+class _How(NamedTuple):
+    """What of a schedule is compiled: steps of a round, the type of products, and how steps are made."""
+
+    steps: int
+    dtype: jnp.dtype
+    by: str
+
+
+@partial(jax.jit, static_argnums=(0, 1))
 def _round(
-    problem: Problem, steps: int, dtype: jnp.dtype, numbers: Array, state: State, data: Tree, held: Tree, key: Array
+    problem: Problem, how: _How, numbers: Array, state: State, data: Tree, held: Tree, key: Array
 ) -> tuple[State, Float[Array, " 4"]]:
-    """Some steps and a look; of the last step: loss, then the check, the gradient's norm and the rate."""
-    adam = moments()
-
-    def loss(parameters: Tree, key: Array) -> Array:
-        return problem.loss(jax.tree.map(lambda leaf: leaf.astype(dtype), parameters), data, key)
+    """Some steps and a look: the steps' mean loss, the check, and norm of the gradient and rate of the last step."""
 
     def step(carry: tuple[Array, Tree, Tree], _: None) -> tuple[tuple[Array, Tree, Tree], Float[Array, " 2"]]:
-        count, parameters, memory = carry
-        value, gradient = jax.value_and_grad(loss)(parameters, jax.random.fold_in(key, count))
-        norm = optax.tree.norm(gradient)
-        gradient = jax.tree.map(lambda leaf: leaf * jnp.minimum(1, numbers[3] / jnp.maximum(norm, 1e-30)), gradient)
-        updates, memory = adam.update(gradient, memory)
-        pace, decay = rate(numbers, count), numbers[1]
-        parameters = jax.tree.map(lambda leaf, update: leaf - pace * (update + decay * leaf), parameters, updates)
-        return (count + 1, parameters, memory), jnp.stack([value, norm])
+        count, parameters, remembered = carry
+        drawn = jax.random.fold_in(key, count)
 
-    (count, parameters, memory), seen = jax.lax.scan(step, (state.step, state.parameters, state.memory), None, length=steps)
+        def loss(parameters: Tree) -> Array:
+            return problem.loss(jax.tree.map(lambda leaf: leaf.astype(how.dtype), parameters), data, drawn)
+
+        made = _adam if how.by == "adam" else _l_bfgs
+        parameters, remembered, value, norm = made(loss, parameters, remembered, numbers, count)
+        return (count + 1, parameters, remembered), jnp.stack([value, norm])
+
+    (count, parameters, remembered), seen = jax.lax.scan(
+        step, (state.step, state.parameters, state.memory), None, length=how.steps
+    )
     now = problem.check(parameters, held)
     better = now < state.lowest  # never of NaN: parameters that are not finite are not kept
     best = jax.tree.map(lambda a, b: jnp.where(better, a, b), parameters, state.best)
     waited = jnp.where(better, 0, state.waited + 1)
-    after = State(count, parameters, memory, best, jnp.where(better, now, state.lowest), waited)
+    after = State(count, parameters, remembered, best, jnp.where(better, now, state.lowest), waited)
     return after, jnp.stack([seen[:, 0].mean(), now, seen[-1, 1], rate(numbers, count - 1)])
+
+
+Loss = Callable[[Tree], Array]
+
+
+def _adam(loss: Loss, parameters: Tree, remembered: Tree, numbers: Array, count: Array) -> tuple[Tree, Tree, Array, Array]:
+    value, gradient = jax.value_and_grad(loss)(parameters)
+    norm = optax.tree.norm(gradient)
+    gradient = jax.tree.map(lambda leaf: leaf * jnp.minimum(1, numbers[3] / jnp.maximum(norm, 1e-30)), gradient)
+    updates, remembered = memory("adam").update(gradient, remembered)
+    pace, decay = rate(numbers, count), numbers[1]
+    parameters = jax.tree.map(lambda leaf, update: leaf - pace * (update + decay * leaf), parameters, updates)
+    return parameters, remembered, value, norm
+
+
+def _l_bfgs(loss: Loss, parameters: Tree, remembered: Tree, numbers: Array, count: Array) -> tuple[Tree, Tree, Array, Array]:
+    value, gradient = optax.value_and_grad_from_state(loss)(parameters, state=remembered)
+    updates, remembered = memory("l-bfgs").update(gradient, remembered, parameters, value=value, grad=gradient, value_fn=loss)
+    return optax.apply_updates(parameters, updates), remembered, value, optax.tree.norm(gradient)

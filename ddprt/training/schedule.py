@@ -9,11 +9,14 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class Schedule(BaseModel):
-    """Adam with decoupled weight decay, clipped gradients, and a rate that warms up and falls as a cosine.
+    """How steps are made: by Adam or by L-BFGS.
 
-    Settings of a learned method: it repeats those fields that its users may set.
+    Adam has decoupled weight decay, clipped gradients, and a rate that warms up and falls as a cosine. L-BFGS is for smooth
+    problems whose loss has no chance in it: a line search finds the length of each step, so that rate, decay and clip do
+    nothing. A learned method repeats those fields that its users may set.
 
-    Reference: Loshchilov and Hutter, "Decoupled Weight Decay Regularization", ICLR 2019.
+    Reference: Loshchilov and Hutter, "Decoupled Weight Decay Regularization", ICLR 2019; Nocedal and Wright, "Numerical
+    Optimization", 2006, algorithms 7.5 and 3.5.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -25,6 +28,7 @@ class Schedule(BaseModel):
     check_every: int = Field(50, ge=1, description="steps between looks at the validation data")
     patience: int = Field(0, ge=0, description="looks without a better one before training stops; 0 trains to the end")
     precision: Literal["float32", "bfloat16"] = "float32"
+    by: Literal["adam", "l-bfgs"] = "adam"
 
     @property
     def round(self) -> int:
@@ -56,6 +60,6 @@ def rate(numbers: Float[Array, " 5"], step: Int[Array, ""]) -> Float[Array, ""]:
     return peak * jnp.where(step < rising, (step + 1) / jnp.maximum(rising, 1), cosine)
 
 
-def moments() -> optax.GradientTransformation:
-    """What remembers gradients; scale, decay and clip are the loop's."""
-    return optax.scale_by_adam()
+def memory(by: str) -> optax.GradientTransformation:
+    """What remembers gradients; Adam's rate, decay and clip are the loop's."""
+    return optax.scale_by_adam() if by == "adam" else optax.lbfgs(memory_size=20)
