@@ -16,7 +16,11 @@ from ddprt.methods import METHODS
 from ddprt.methods.method import AsksForLights
 from ddprt.runtime.model import Model
 
-SETTINGS: dict[str, dict[str, Any]] = {"mlp": {"steps": 300, "width": 32}, "sh-prt": {"order": 1, "space": "linear"}}
+SETTINGS: dict[str, dict[str, Any]] = {
+    "mlp": {"steps": 300, "width": 32},
+    "residual": {"steps": 300, "width": 32},
+    "sh-prt": {"order": 1, "space": "linear"},
+}
 
 
 def asks(method: str) -> bool:

@@ -7,7 +7,7 @@ great errors decide a mean of squares: the mean of norms is minimised instead. A
 cancels where a lighting decides its own fit: it is summed from its positive parts.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -132,6 +132,18 @@ def left_out(
     The second is for generalised cross-validation, which puts the mean of 1 - h in the place of each (Golub, Heath and
     Wahba 1979).
     """
+    found = [[np.sum(part**2, 1) for part in both] for both in _errors(spectrum, ridges)]
+    each, generalised = np.array(found).reshape(len(ridges), 2, -1).swapaxes(0, 1)
+    return each, generalised
+
+
+def missed(spectrum: Spectrum, ridge: float) -> Float[np.ndarray, "lightings bases"]:
+    """What each lighting's coefficients are off by, true less predicted, when it is left out with its like."""
+    return next(_errors(spectrum, np.array([ridge])))[0]
+
+
+def _errors(spectrum: Spectrum, ridges: Float[np.ndarray, " ridges"]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """For each ridge the vectors whose squares `left_out` sums."""
     Q, S, QtC, C = (np.asarray(part) for part in (spectrum.left, spectrum.values, spectrum.turned, spectrum.targets))
     group, count = spectrum.group, spectrum.count
     held = np.arange(len(S)) < spectrum.rank
@@ -145,8 +157,7 @@ def left_out(
     def parts(share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return Q @ (share[:, None] * QtC), squares @ share
 
-    each, generalised = np.zeros((2, len(ridges), len(C)))
-    for index, ridge in enumerate(ridges):
+    for ridge in ridges:
         # e_k = ((Id - H) c)_k / (1 - h_kk), where Id - H = Q diag(t) Q^T with t = ridge / (S² + ridge), 1 past the rank.
         sizes = _positive(np.where(held, S**2 + ridge, 1))
         least = np.min(sizes, where=held, initial=np.inf)
@@ -163,9 +174,7 @@ def left_out(
             root = np.sqrt(share)[:, None]
             error[rows[0]] = np.linalg.lstsq(root * Q[rows].T, root * QtC, rcond=None)[0][0]
         # Twins share a prediction: their mean target less the error of their row.
-        for found, row in ((each, error), (generalised, general)):
-            found[index] = np.sum((inward + row[group] * weight) ** 2, 1)
-    return each, generalised
+        yield inward + error[group] * weight, inward + general[group] * weight
 
 
 def choose_ridge(

@@ -15,6 +15,7 @@ from ddprt.methods.autoencoder import Autoencoder
 from ddprt.methods.floors import MeanLightmap, NearestLighting
 from ddprt.methods.method import Method
 from ddprt.methods.mlp import Mlp
+from ddprt.methods.residual import Residual
 from ddprt.methods.sh_prt import ShPrt
 from ddprt.methods.svd_ridge import SvdRidge
 
@@ -26,6 +27,7 @@ METHODS: Catalogue[type[Method]] = Catalogue(
         "nearest": NearestLighting,
         "mlp": Mlp,
         "autoencoder": Autoencoder,
+        "residual": Residual,
         "sh-prt": ShPrt,
     },
 )

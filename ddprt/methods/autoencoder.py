@@ -37,7 +37,7 @@ class Autoencoder(Learned):
         entries = jnp.asarray(entry_weights(train.area, train.weights, train.channels))  # type: ignore[arg-type]
         seen, held = (_light(part, entries) for part in (train, validation))
         trained = self.trained("autoencoder", Subspace(min(self.bases, len(entries))), seen, held, key)
-        basis = _basis(trained.parameters, columns(train)[0], entries, self.bases)
+        basis = _basis(trained.parameters, _rows(train), entries, self.bases)
         relighter = transfer_to(basis, train, self.ridge)
         report = relighter.report.noting(*statuses(trained))
         return replace(relighter, report=replace(report, loss=losses(trained)))
@@ -71,8 +71,14 @@ class Subspace:
         return jnp.sum(outside**2) / held.squares
 
 
+def _rows(examples: Examples) -> Float[Array, "columns entries"]:
+    rows, _ = columns(replace(examples, indirect=in_memory(examples.indirect)))
+    assert isinstance(rows, Array)  # what is in memory gives rows that are
+    return rows
+
+
 def _light(examples: Examples, entries: Float[Array, " entries"]) -> Light:
-    rows = columns(replace(examples, indirect=in_memory(examples.indirect)))[0] * jnp.sqrt(entries)
+    rows = _rows(examples) * jnp.sqrt(entries)
     return Light(rows, jnp.maximum(jnp.sum(rows**2), jnp.finfo(jnp.float32).tiny))
 
 

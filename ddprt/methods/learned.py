@@ -1,5 +1,6 @@
 """What learned methods share: how they are trained, and coefficients of a basis as what is to be learned."""
 
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
@@ -90,11 +91,55 @@ class Seen(NamedTuple):
         return jnp.mean(self.importance[..., None] * share * (found.astype(jnp.float32) - self.targets) ** 2)
 
 
+def grouped(values: Float[Array, "frames _ 3"], groups: int) -> Float[Array, "frames groups _inputs"]:
+    """Channels apart (3 groups) or interleaved (1): what a transfer is applied to."""
+    return jnp.moveaxis(values, 2, 1) if groups == 3 else values.reshape(len(values), 1, -1)
+
+
 @partial(jax.jit, static_argnums=0)
 def _seen(groups: int, values: Array, light: Array, scale: Array, vectors: Array, entries: Array) -> Seen:
-    inputs = jnp.moveaxis(values, 2, 1) if groups == 3 else values.reshape(len(values), 1, -1)
-    rows = jnp.moveaxis(light, 2, 1) if groups == 3 else light.reshape(len(light), 1, -1)
+    inputs, rows = grouped(values, groups), grouped(light, groups)
     targets = jnp.matmul(rows * entries, vectors.T, precision="highest")
     share = (scale[:, :groups] / jnp.maximum(jnp.max(scale), jnp.finfo(jnp.float32).tiny)) ** 2
     importance = share / jnp.maximum(jnp.mean(share), jnp.finfo(jnp.float32).tiny)
     return Seen(inputs, targets, importance, jnp.ones(len(vectors)))
+
+
+@dataclass(frozen=True)
+class Network:
+    """See `Problem`: dense layers from measurements to coefficients.
+
+    Attributes:
+      width, depth: of the hidden layers.
+      silent: start with an answer of 0, for what corrects others.
+    """
+
+    width: int
+    depth: int
+    silent: bool = False
+
+    def initial(self, data: Seen, key: Array) -> Layers:
+        """See `dense_layers`."""
+        groups, inputs = data.inputs.shape[1:]
+        layers = dense_layers([groups + inputs, *[self.width] * self.depth, data.targets.shape[2]], key)
+        return (*layers[:-1], jax.tree.map(jnp.zeros_like, layers[-1])) if self.silent else layers
+
+    def loss(self, parameters: Layers, data: Seen, key: Array) -> Float[Array, ""]:
+        """Of all lightings at once."""
+        return self.check(parameters, data)
+
+    def check(self, parameters: Layers, held: Seen) -> Float[Array, ""]:
+        """Mean squared error of light, in units of the training light's."""
+        return held.error(forward(parameters, held.inputs))
+
+
+def forward(layers: Layers, values: Float[Array, "frames groups inputs"]) -> Float[Array, "frames groups bases"]:
+    """Dense layers with GELU between them; groups are told apart by a one-hot input."""
+    frames, groups = values.shape[:2]
+    which = jnp.broadcast_to(jnp.eye(groups, dtype=values.dtype), (frames, groups, groups))
+    # Unit-norm measurements are small numbers; this brings them to about 1.
+    hidden = jnp.concatenate([values * jnp.sqrt(values.shape[2]), which], -1).astype(layers[0][0].dtype)
+    for weight, bias in layers[:-1]:
+        hidden = jax.nn.gelu(hidden @ weight + bias)
+    weight, bias = layers[-1]
+    return hidden @ weight + bias

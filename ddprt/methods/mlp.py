@@ -6,14 +6,13 @@ Same basis, same split and same metrics as the baseline, so the comparison exist
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from pydantic import Field
 
 from ddprt.fitting.basis import entry_weights, fit_basis
-from ddprt.methods.learned import Layers, Learned, Seen, dense_layers, losses, statuses
+from ddprt.methods.learned import Learned, Network, Seen, forward, grouped, losses, statuses
 from ddprt.methods.method import Examples, FitReport, Frame, array_bytes, as_pytree, columns, found_in, static
 
 
@@ -32,8 +31,9 @@ class Perceptron:
     def predict(self, frame: Frame) -> Float[Array, "frames texels 3"]:
         """See `Relighter`."""
         frames = len(frame.values)
-        values = jnp.moveaxis(frame.values, 2, 1) if self.groups == 3 else frame.values.reshape(frames, 1, -1)
-        coefficients = _forward(tuple(zip(self.weights, self.biases, strict=True)), values) * self.spread
+        coefficients = (
+            forward(tuple(zip(self.weights, self.biases, strict=True)), grouped(frame.values, self.groups)) * self.spread
+        )
         light = jnp.matmul(coefficients, self.basis, precision="highest")
         return jnp.moveaxis(light, 1, 2) if self.groups == 3 else light.reshape(frames, -1, 3)
 
@@ -78,36 +78,3 @@ class Mlp(Learned):
         ).noting(*found_in(train), basis.status, *statuses(trained))
         weights, biases = zip(*trained.parameters, strict=True)
         return Perceptron(weights, biases, basis.vectors, spread, groups, report)
-
-
-@dataclass(frozen=True)
-class Network:
-    """See `Problem`: dense layers from measurements to coefficients."""
-
-    width: int
-    depth: int
-
-    def initial(self, data: "Seen", key: Array) -> Layers:
-        """He-normal weights, zero biases."""
-        groups, inputs = data.inputs.shape[1:]
-        return dense_layers([groups + inputs, *[self.width] * self.depth, data.targets.shape[2]], key)
-
-    def loss(self, parameters: Layers, data: "Seen", key: Array) -> Float[Array, ""]:
-        """Of all lightings at once."""
-        return self.check(parameters, data)
-
-    def check(self, parameters: Layers, held: "Seen") -> Float[Array, ""]:
-        """Mean squared error of light, in units of the training light's."""
-        return held.error(_forward(parameters, held.inputs))
-
-
-def _forward(layers: Layers, values: Float[Array, "frames groups inputs"]) -> Float[Array, "frames groups bases"]:
-    frames, groups = values.shape[:2]
-    which = jnp.broadcast_to(jnp.eye(groups, dtype=values.dtype), (frames, groups, groups))
-    # Unit-norm measurements are small numbers; this brings them to about 1.
-    hidden = jnp.concatenate([values * jnp.sqrt(values.shape[2]), which], -1)
-    hidden = hidden.astype(layers[0][0].dtype)
-    for weight, bias in layers[:-1]:
-        hidden = jax.nn.gelu(hidden @ weight + bias)
-    weight, bias = layers[-1]
-    return hidden @ weight + bias

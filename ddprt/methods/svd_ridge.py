@@ -129,7 +129,7 @@ def transfer_to(
       centre: whether the basis has a mean, so that measurements have one too.
       smooth: see `SvdRidge`.
     """
-    per_group = _spread(basis.coefficients, train, basis.vectors.shape[0])
+    per_group = targets(basis, train)
     seen = measured(train) if basis.rank else []
     inputs = train.frame.values.shape[1] * (1 if train.channels == "mono" else 3)
     stretch = point_stretch(ridge, inputs)
@@ -198,8 +198,9 @@ def _smoothed(X: Array, C: Array, root: np.ndarray, *, intercept: bool) -> Spect
         return replace(spectrum, right=jnp.asarray(np.asarray(spectrum.right) @ root.T), offset=jnp.asarray(offset))
 
 
-def _spread(coefficients: Array, train: Examples, bases: int) -> list[np.ndarray]:
-    """Coefficients of the lit columns back in their (group, lighting) places, zero for dark ones."""
+def targets(basis: Basis, train: Examples) -> list[np.ndarray]:
+    """Coefficients of the lit columns in their places, (lightings, bases) for each group, zero for dark ones."""
+    coefficients, bases = basis.coefficients, len(basis.vectors)
     groups = 3 if train.channels == "mono" else 1
     lit = np.asarray(train.scale[:, :groups]).reshape(-1) > 0
     placed = np.zeros((len(lit), bases))
