@@ -38,7 +38,10 @@ def compared(found: Any, expected: Any, error: Any = None, *, unit: float = 0.0)
     size = np.full(expected.shape, unit) if unit else np.abs(expected)
     figure = {"closed_form_error": float((np.abs(found - expected) / size).max())}
     if error is not None:
-        figure["standard_error"] = float(np.sqrt(((np.asarray(error) / size) ** 2).mean()))
+        share = np.asarray(error, float) / size
+        figure["standard_error"] = (
+            float(np.sqrt((share[share > 0] ** 2).mean())) if share.any() else 0.0
+        )  # what is dark is sure
     return figure
 
 

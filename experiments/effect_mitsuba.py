@@ -90,18 +90,20 @@ def second_opinion(name: str) -> dict[str, float] | None:
 
 
 def staged(name: str) -> Stage:
-    """The Cornell box under a lamp, some of it of metal, or leaves under one."""
+    """The Cornell box under a lamp, some of it of metal; a corridor under one; or leaves."""
     if name in ("cut-outs", "two-sided sheets"):
         leaves = build("leaves")
         lamp = {"type": "point", "position": [1.0, 1.9, 1.0], "intensity": [1.0, 1.0, 1.0]}
         return Stage(leaves if name == "cut-outs" else force(leaves, off=["cut-outs"]), lamp)
+    if name == "diffuse bounces":
+        return Stage(build("corridor"), {**POINT, "position": [1.2, 1.6, 1.0]})
     scene = build("cornell")
     if name == "gloss":
         material = scene.material.copy()
         material[8:28] = len(scene.materials)  # the blocks
         gilt = Material("gilt", (0.9, 0.65, 0.3), gloss=Gloss(0.45, 1.0))
         return Stage(replace(scene, material=material, materials=(*scene.materials, gilt)), POINT)
-    light = LIGHTS.get(name, POINT)
+    light = LIGHTS[name]
     return Stage(shaded(scene, light), light)
 
 
