@@ -70,16 +70,16 @@ class EnvironmentLight(LightModel):
         Raises:
           UserError: the image is missing, damaged, or no picture of light.
         """
-        from ddprt.harmonics import turned
+        from ddprt import harmonics
         from ddprt.lights.panorama import stamp
 
         unturned = _projected(self.image, stamp(self.image), order)
-        return self.scale * turned(unturned, np.deg2rad(self.rotation_deg))
+        return self.scale * harmonics.turned(unturned, np.deg2rad(self.rotation_deg))
 
 
 @lru_cache(32)  # 1024 x 512 pixels take 50 ms, which every turn of a sky would pay anew
 def _projected(image: str, stamp: tuple[int, ...], order: int) -> Float64[np.ndarray, "harmonics 3"]:
-    from ddprt.harmonics import of_panorama
+    from ddprt import harmonics
     from ddprt.lights.sky import load_sky
 
-    return of_panorama(load_sky(image).radiance, order)
+    return harmonics.of_panorama(load_sky(image).radiance, order)
