@@ -6,6 +6,7 @@ that the path came from, and each light is weighed by that; paths go on where th
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -89,9 +90,12 @@ class GlossyVertices:
 
     def lit_from(self, directions: Float32[np.ndarray, "n 3"]) -> Vertices:
         """What each W/m² that arrives from directions is worth to the receivers."""
-        cosine = np.einsum("dn,nd->n", self.place[3:], directions)
-        factor = np.divide(np.float32(np.pi), cosine, out=np.zeros_like(cosine), where=cosine > 0)
-        return replace(self.there, throughput=self.there.throughput * (self.lobes.reflected(directions).T * factor))
+        lobes, there = self.lobes, self.there
+        return replace(there, throughput=ggx.weigh(self._held, lobes.frames, lobes.outgoing, directions, there.throughput))
+
+    @cached_property
+    def _held(self) -> Float32[np.ndarray, "n 11"]:
+        return ggx.prepared(self.lobes.outgoing, self.lobes.base, self.lobes.gloss)
 
     def go_on(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Origins and directions of the paths that survive roulette, their throughput and receivers."""
