@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from ddprt import warp
-from ddprt.axes import Bool, Float32, Int32
+from ddprt.axes import Bool, Float32, Int, Int32
 from ddprt.scene.material import Material, bilinear
 from ddprt.scene.mesh import Scene
 from ddprt.transport import ggx
@@ -45,7 +45,11 @@ class Lobes:
         incoming, weight = ggx.sample(self.outgoing, u, self.base, self.gloss)
         return warp.to_world(incoming, self.frames), weight
 
-    def part(self, which: slice) -> "Lobes":
+    def density(self, directions: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, " n"]:
+        """Of what `scattered` gives, per steradian, at world directions."""
+        return ggx.pdf(self.outgoing, _to_local(directions, self.frames), self.base, self.gloss)
+
+    def part(self, which: slice | Int[np.ndarray, " some"]) -> "Lobes":
         """Some of them."""
         return Lobes(self.frames[which], self.outgoing[which], self.base[which], self.gloss[which])
 
