@@ -67,6 +67,23 @@ def probe_layers(config: Config, scene: Scene) -> list[dict[str, Any]]:
     return [{"name": NAME, "quantity": "irradiance", "order": probes.ORDER, **places, **glows}]
 
 
+def placed_probes(module: ModuleType, config: Config, scene: Scene, tracer: Tracer, atlas: Atlas) -> Layer:
+    """Where probes stand, `module` being their file. Those not in free air count nothing, the others as much as the lightmap.
+
+    Raises:
+      UserError: none is in free air.
+    """
+    position = module.places(config.probes, scene.bounds)
+    valid = module.in_the_open(tracer, position)
+    if not valid.any():
+        raise UserError(
+            f"probes: got {len(position)}, none of them in free air, expected some; move the grid (probes.region_low and "
+            "region_high) or the positions of the file out of solids and walls"
+        )
+    weight = np.where(valid, atlas.area.sum() / valid.sum(), 0.0)
+    return Layer(NAME, "irradiance", module.ORDER, position, weight, np.full(len(position), -1))
+
+
 @dataclass(frozen=True, eq=False)
 class ProbeBake:
     """What is needed to bake probes.
@@ -90,8 +107,6 @@ class ProbeBake:
     ) -> "ProbeBake | None":
         """Places probes, unless they are there; None where a plan does not call for any.
 
-        Probes that are not in free air count nothing, the others together as much as the lightmap.
-
         Raises:
           UserError: none is in free air.
         """
@@ -100,15 +115,7 @@ class ProbeBake:
             return None
         if manifest.holds(layer_name(NAME, "places")):
             return cls(module, read_layer(dataset, NAME), config, tracer, dataset, manifest)
-        position = module.places(config.probes, scene.bounds)
-        valid = module.in_the_open(tracer, position)
-        if not valid.any():
-            raise UserError(
-                f"probes: got {len(position)}, none of them in free air, expected some; move the grid (probes.region_low and "
-                "region_high) or the positions of the file out of solids and walls"
-            )
-        weight = np.where(valid, atlas.area.sum() / valid.sum(), 0.0)
-        layer = Layer(NAME, "irradiance", module.ORDER, position, weight, np.full(len(position), -1))
+        layer = placed_probes(module, config, scene, tracer, atlas)
         write_places(dataset.folder, layer, manifest)
         return cls(module, layer, config, tracer, dataset, manifest)
 

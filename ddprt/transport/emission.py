@@ -9,7 +9,7 @@ vertices emitters are looked for in the same way, at glossy ones with a ray of t
 Reference: Veach and Guibas, "Optimally Combining Sampling Techniques for Monte Carlo Rendering", SIGGRAPH 1995.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -28,7 +28,7 @@ from ddprt.transport.direct import Places
 from ddprt.transport.embree import Tracer, lifted
 from ddprt.transport.glossiness import glossy
 
-_FEW, _MOST = 16, 4096  # samples of each texel and half that tell the noise, and that are taken unasked
+FEW, MOST = 16, 4096  # samples of each texel and half that tell the noise, and that are taken unasked
 _BATCH = 1 << 15  # samples that go through together
 _LOOKED_UP = 64  # places of a textured triangle that tell its power
 _FAINTEST = 1 / 64  # of the power that the brightest of its texels would give it: what lies between those places
@@ -246,13 +246,13 @@ def constant_light(
     if len(emitters.triangle) == 0:
         dark = np.zeros((atlas.count, 3), np.float32)
         return Constant(dark, dark, dark, {"emitters": 0}, 0.0)
-    samples = _FEW if config.test_samples == "auto" else max(1, config.test_samples // 2)
-    direct = [_direct(emitters, tracer, atlas, samples, seed, half) for half in range(2)]
+    samples = FEW if config.test_samples == "auto" else max(1, config.test_samples // 2)
+    direct = [straight(emitters, tracer, atlas, samples, seed, half) for half in range(2)]
     if config.test_samples == "auto":
-        wanted = int(min(_MOST, np.ceil(_FEW * (_relative(direct, atlas) / config.target_noise) ** 2)))
+        wanted = wanted_samples(direct, atlas.area, config.target_noise)
         if wanted > samples:
             samples = wanted
-            direct = [_direct(emitters, tracer, atlas, samples, seed, half) for half in range(2)]
+            direct = [straight(emitters, tracer, atlas, samples, seed, half) for half in range(2)]
     facts: dict[str, Any] = {"emitters": len(emitters.triangle), "direct_samples": 2 * samples}
     halves = direct
     if bounces != 0:
@@ -262,21 +262,34 @@ def constant_light(
             indirect, rays = _by_operator(emitters, tracer, atlas, direct, config, seed, bounces)
         facts["samples"] = rays
         halves = [one + other for one, other in zip(direct, indirect, strict=True)]
-    relative = _relative(halves, atlas)
+    relative = _relative(halves, atlas.area)
     facts["noise"] = float(f"{relative:.3g}")
     irradiance, noise = (halves[0] + halves[1]) / 2, (halves[0] - halves[1]) / 2
     return Constant(irradiance, noise, (direct[0] + direct[1]) / 2, facts, relative)
 
 
-def _direct(
-    emitters: Emitters, tracer: Tracer, atlas: Atlas, samples: int, seed: int, half: int
+def wanted_samples(
+    halves: Sequence[Float32[np.ndarray, "texels 3"]], area: Float64[np.ndarray, " texels"], target: float
+) -> int:
+    """Samples of each texel and half that a noise takes, from two halves of `FEW`."""
+    return int(min(MOST, np.ceil(FEW * (_relative(halves, area) / target) ** 2)))
+
+
+def straight(
+    emitters: Emitters,
+    tracer: Tracer,
+    atlas: Atlas,
+    samples: int,
+    seed: int,
+    half: int,
+    chosen: Int[np.ndarray, " texels"] | None = None,
 ) -> Float32[np.ndarray, "texels 3"]:
-    """Mean direct irradiance of each texel: places, points and directions from one sequence, shifted for each texel."""
+    """Mean direct irradiance of texels: places, points and directions from one sequence, shifted for each texel."""
     sequence = warp.sobol(samples, 6, seeds.number(seed, "emission", half, samples))
-    block = max(1, _BATCH // samples)
+    block, wanted = max(1, _BATCH // samples), np.arange(atlas.count) if chosen is None else chosen
 
     def work(first: int) -> Float32[np.ndarray, "some 3"]:
-        texels = np.arange(first, min(first + block, atlas.count))
+        texels = wanted[first : first + block]
         shift = seeds.stream(seed, "emission", half, samples, first).random((len(texels), 1, 6), np.float32)
         u = (shift + sequence).reshape(-1, 6)
         u -= u >= 1
@@ -285,7 +298,7 @@ def _direct(
         light = emitters.irradiance(tracer, lifted(tracer, positions, normals), normals, u[:, 2:])
         return light.reshape(len(texels), samples, 3).mean(1).astype(np.float32)
 
-    return np.concatenate(list(tracer.map(work, range(0, atlas.count, block))))
+    return np.concatenate(list(tracer.map(work, range(0, len(wanted), block))))
 
 
 def _by_operator(
@@ -351,8 +364,8 @@ def _by_paths(
     return [half[0] for half in halves], float(2 * each)
 
 
-def _relative(halves: list[Float32[np.ndarray, "texels 3"]], atlas: Atlas) -> float:
+def _relative(halves: Sequence[Float32[np.ndarray, "texels 3"]], area: Float64[np.ndarray, " texels"]) -> float:
     """RMS of half the difference over that of the mean, over the surface."""
     one, other = (half.astype(np.float64) for half in halves)
-    noise, light = (np.einsum("t,tc->", atlas.area, part**2) for part in (one - other, one + other))
+    noise, light = (np.einsum("t,tc->", area, part**2) for part in (one - other, one + other))
     return float(np.sqrt(noise / light)) if light > 0 else 0.0

@@ -43,36 +43,8 @@ def evaluate(outgoing: Directions, incoming: Directions, base: Directions, gloss
       gloss: roughness, metallic and the dielectric's reflectance, each 0 to 1.
     """
     value = np.empty((len(outgoing), 3), np.float32)
-    _evaluate(outgoing, incoming, base, gloss, *_tables(), value)
+    _evaluate(outgoing, incoming, base, gloss, *tables(), value)
     return value
-
-
-def prepared(outgoing: Directions, base: Directions, gloss: Directions) -> Float32[np.ndarray, "n 11"]:
-    """What of `evaluate` is the same wherever light comes from, for `weigh`."""
-    held = np.empty((len(outgoing), 11), np.float32)
-    _prepare(outgoing, base, gloss, *_tables(), held)
-    return held
-
-
-def weigh(
-    held: Float32[np.ndarray, "n 11"],
-    frames: Float32[np.ndarray, "n 3 3"],
-    outgoing: Float32[np.ndarray, "n 3"],
-    directions: Float32[np.ndarray, "n 3"],
-    throughput: Float32[np.ndarray, "3 n"],
-) -> Float32[np.ndarray, "3 n"]:
-    """Throughput times pi times the BSDF, for light from world directions: `evaluate` in single precision, many times over.
-
-    Args:
-      held: see `prepared`.
-      frames: rows tangent, bitangent, normal.
-      outgoing: unit, in these frames.
-      directions: unit, world.
-      throughput: per channel.
-    """
-    weighed = np.empty(throughput.shape, np.float32)
-    _weigh(held, frames, outgoing, directions, throughput, _single_table(), weighed)
-    return weighed
 
 
 def sample(
@@ -84,14 +56,14 @@ def sample(
       The directions, and `evaluate` over `pdf` there: 0 where a facet reflects below the surface.
     """
     incoming, weight = np.empty((2, len(outgoing), 3), np.float32)
-    _sample(outgoing, u, base, gloss, *_tables(), incoming, weight)
+    _sample(outgoing, u, base, gloss, *tables(), incoming, weight)
     return incoming, weight
 
 
 def pdf(outgoing: Directions, incoming: Directions, base: Directions, gloss: Directions) -> Float32[np.ndarray, " n"]:
     """Density of `sample`, per steradian; its integral over the hemisphere is the share of samples that stay above it."""
     density = np.empty(len(outgoing), np.float32)
-    _pdf(outgoing, incoming, base, gloss, *_tables(), density)
+    _pdf(outgoing, incoming, base, gloss, *tables(), density)
     return density
 
 
@@ -129,7 +101,7 @@ def invert_visible(facing: Directions, outgoing: Directions, alpha: Float[np.nda
 
 def albedo(cosine: Float[np.ndarray, " n"], roughness: float, f0: float) -> Float64[np.ndarray, " n"]:
     """Share of light along directions of some cosine to the normal that facets of reflectance f0 send back."""
-    table, _ = _tables()
+    table, _ = tables()
     found = np.empty(len(cosine))
     _albedos(cosine, roughness, f0, table, found)
     return found
@@ -137,12 +109,12 @@ def albedo(cosine: Float[np.ndarray, " n"], roughness: float, f0: float) -> Floa
 
 def mean_albedo(roughness: float, f0: float) -> float:
     """The same of light from everywhere."""
-    _, means = _tables()
-    return _between_means(means, float(roughness), float(f0))
+    _, means = tables()
+    return between_means(means, float(roughness), float(f0))
 
 
 @lru_cache(maxsize=1)
-def _tables() -> tuple[np.ndarray, np.ndarray]:
+def tables() -> tuple[np.ndarray, np.ndarray]:
     """Albedos of facets by roots of roughness and cosine, f0 times the first plus the second; and their means.
 
     The means are those of what is interpolated, so that the diffuse part gives back exactly what the table takes.
@@ -156,11 +128,6 @@ def _tables() -> tuple[np.ndarray, np.ndarray]:
     right = (first - low * whole) / step
     means = np.einsum("s,rsk->rk", whole - right, table[:, :-1]) + np.einsum("s,rsk->rk", right, table[:, 1:])
     return table, means
-
-
-@lru_cache(maxsize=1)
-def _single_table() -> Float32[np.ndarray, "rough tilt 2"]:
-    return _tables()[0].astype(np.float32)
 
 
 @compiled
@@ -191,7 +158,7 @@ def _visible_all(u: np.ndarray, outgoing: np.ndarray, alpha: np.ndarray, facing:
 
 
 @compiled
-def _root(alpha: float, cosine: float) -> float:
+def root(alpha: float, cosine: float) -> float:
     """Of Smith's term: what a direction's facets hide."""
     return np.sqrt(alpha * alpha + (1 - alpha * alpha) * cosine * cosine)
 
@@ -208,7 +175,7 @@ def _facets(outgoing: np.ndarray, incoming: np.ndarray, alpha: float) -> tuple[f
 
 
 @compiled
-def _between(table: np.ndarray, roughness: float, cosine: float, f0: float) -> float:
+def between(table: np.ndarray, roughness: float, cosine: float, f0: float) -> float:
     """Albedo of facets, between the table's nodes."""
     row = np.sqrt((roughness - SMOOTHEST) / (1 - SMOOTHEST)) * (table.shape[0] - 1)
     column = np.sqrt(np.sqrt(cosine)) * (table.shape[1] - 1)
@@ -223,7 +190,7 @@ def _between(table: np.ndarray, roughness: float, cosine: float, f0: float) -> f
 
 
 @compiled
-def _between_means(means: np.ndarray, roughness: float, f0: float) -> float:
+def between_means(means: np.ndarray, roughness: float, f0: float) -> float:
     row = np.sqrt((max(roughness, SMOOTHEST) - SMOOTHEST) / (1 - SMOOTHEST)) * (len(means) - 1)
     r = min(int(row), len(means) - 2)
     down = row - r
@@ -233,7 +200,7 @@ def _between_means(means: np.ndarray, roughness: float, f0: float) -> float:
 @compiled
 def _albedos(cosine: np.ndarray, roughness: float, f0: float, table: np.ndarray, found: np.ndarray) -> None:
     for i in range(len(cosine)):
-        found[i] = _between(table, max(roughness, SMOOTHEST), cosine[i], f0)
+        found[i] = between(table, max(roughness, SMOOTHEST), cosine[i], f0)
 
 
 @compiled
@@ -250,7 +217,7 @@ def _integrate(rough: np.ndarray, tilt: np.ndarray, table: np.ndarray) -> None:
                 along = a * x + c * z
                 under = 2 * along * c - z
                 if under > 0:
-                    share = under * (z + _root(alpha, z)) / (z * _root(alpha, under) + under * _root(alpha, z))
+                    share = under * (z + root(alpha, z)) / (z * root(alpha, under) + under * root(alpha, z))
                     whole += share
                     grazing += share * max(0.0, 1 - along) ** 5
             table[r, t, 0], table[r, t, 1] = (whole - grazing) / _LATTICE, grazing / _LATTICE
@@ -262,8 +229,8 @@ def _odds(outgoing: np.ndarray, base: np.ndarray, gloss: np.ndarray, table: np.n
     roughness, metallic, dielectric = max(float(gloss[0]), SMOOTHEST), float(gloss[1]), float(gloss[2])
     colour = (float(base[0]) + float(base[1]) + float(base[2])) / 3
     out = float(outgoing[2])
-    facets = _between(table, roughness, out, dielectric + metallic * (colour - dielectric))
-    diffuse = (1 - metallic) * colour * (1 - _between(table, roughness, out, dielectric))
+    facets = between(table, roughness, out, dielectric + metallic * (colour - dielectric))
+    diffuse = (1 - metallic) * colour * (1 - between(table, roughness, out, dielectric))
     return facets / (facets + diffuse)
 
 
@@ -278,11 +245,11 @@ def _terms(
     roughness, metallic, dielectric = max(float(gloss[0]), SMOOTHEST), float(gloss[1]), float(gloss[2])
     alpha = roughness * roughness
     dense, grazing = _facets(outgoing, incoming, alpha)
-    lobe = 0.5 * dense * under / (out * _root(alpha, under) + under * _root(alpha, out))
-    diffuse = (1 - _between(table, roughness, out, dielectric)) * (1 - _between(table, roughness, under, dielectric))
-    diffuse *= (1 - metallic) * under / (np.pi * (1 - _between_means(means, roughness, dielectric)))
+    lobe = 0.5 * dense * under / (out * root(alpha, under) + under * root(alpha, out))
+    diffuse = (1 - between(table, roughness, out, dielectric)) * (1 - between(table, roughness, under, dielectric))
+    diffuse *= (1 - metallic) * under / (np.pi * (1 - between_means(means, roughness, dielectric)))
     odds = _odds(outgoing, base, gloss, table)
-    density = odds * dense / (2 * (out + _root(alpha, out))) + (1 - odds) * under / np.pi
+    density = odds * dense / (2 * (out + root(alpha, out))) + (1 - odds) * under / np.pi
     return (1 - grazing) * lobe, grazing * lobe, diffuse, density
 
 
@@ -301,67 +268,6 @@ def _evaluate(
         for channel in range(3):
             f0 = gloss[i, 2] + gloss[i, 1] * (base[i, channel] - gloss[i, 2])
             value[i, channel] = f0 * mirrored + grazing + base[i, channel] * diffuse
-
-
-@compiled
-def _prepare(
-    outgoing: np.ndarray, base: np.ndarray, gloss: np.ndarray, table: np.ndarray, means: np.ndarray, held: np.ndarray
-) -> None:
-    """alpha², Smith's root, f0 and the diffuse part's factor of each channel; then where the table is read."""
-    for i in range(len(held)):
-        roughness, metallic, dielectric = max(float(gloss[i, 0]), SMOOTHEST), float(gloss[i, 1]), float(gloss[i, 2])
-        alpha, out = roughness * roughness, float(outgoing[i, 2])
-        held[i, 0], held[i, 1] = alpha * alpha, _root(alpha, out)
-        left = (1 - _between(table, roughness, out, dielectric)) / (1 - _between_means(means, roughness, dielectric))
-        for channel in range(3):
-            held[i, 2 + channel] = dielectric + metallic * (base[i, channel] - dielectric)
-            held[i, 5 + channel] = base[i, channel] * (1 - metallic) * left
-        row = np.sqrt((roughness - SMOOTHEST) / (1 - SMOOTHEST)) * (table.shape[0] - 1)
-        held[i, 8], held[i, 9] = min(int(row), table.shape[0] - 2), row - min(int(row), table.shape[0] - 2)
-        held[i, 10] = dielectric
-
-
-@compiled
-def _weigh(
-    held: np.ndarray,
-    frames: np.ndarray,
-    outgoing: np.ndarray,
-    directions: np.ndarray,
-    throughput: np.ndarray,
-    table: np.ndarray,
-    weighed: np.ndarray,
-) -> None:
-    zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
-    for i in range(len(held)):
-        a, b, c = directions[i, 0], directions[i, 1], directions[i, 2]
-        under, out = frames[i, 2, 0] * a + frames[i, 2, 1] * b + frames[i, 2, 2] * c, outgoing[i, 2]
-        if not (under > zero and out > zero):
-            weighed[0, i], weighed[1, i], weighed[2, i] = zero, zero, zero
-            continue
-        x = outgoing[i, 0] + frames[i, 0, 0] * a + frames[i, 0, 1] * b + frames[i, 0, 2] * c
-        y = outgoing[i, 1] + frames[i, 1, 0] * a + frames[i, 1, 1] * b + frames[i, 1, 2] * c
-        z, squared, root = out + under, held[i, 0], held[i, 1]
-        flat = x * x + y * y
-        size = flat + z * z
-        slope = (flat / squared + z * z) / size
-        hidden = out * np.sqrt(squared + (one - squared) * under * under) + under * root
-        lobe = half / (squared * slope * slope * hidden)
-        short = max(zero, one - half * np.sqrt(size))
-        grazing = short * short * short * short * short
-        mirrored, grazing = (one - grazing) * lobe, grazing * lobe
-        diffuse = zero
-        if held[i, 5] + held[i, 6] + held[i, 7] > zero:
-            column = np.sqrt(np.sqrt(under)) * np.float32(table.shape[1] - 1)
-            r, s = int(held[i, 8]), min(int(column), table.shape[1] - 2)
-            down, right, f0 = held[i, 9], column - np.float32(s), held[i, 10]
-            above = f0 * table[r, s, 0] + table[r, s, 1]
-            above += right * (f0 * table[r, s + 1, 0] + table[r, s + 1, 1] - above)
-            below = f0 * table[r + 1, s, 0] + table[r + 1, s, 1]
-            below += right * (f0 * table[r + 1, s + 1, 0] + table[r + 1, s + 1, 1] - below)
-            diffuse = one - above - down * (below - above)
-        for channel in range(3):
-            value = held[i, 2 + channel] * mirrored + grazing + held[i, 5 + channel] * diffuse
-            weighed[channel, i] = throughput[channel, i] * value
 
 
 @compiled

@@ -14,7 +14,7 @@ from ddprt import warp
 from ddprt.axes import Bool, Float32, Int, Int32
 from ddprt.scene.material import Material, bilinear
 from ddprt.scene.mesh import Scene
-from ddprt.transport import ggx
+from ddprt.transport import ggx, weighing
 from ddprt.transport.embree import Tracer, lifted
 from ddprt.transport.glossiness import glossy
 from ddprt.transport.walk import MAX_SURVIVAL, SURVIVAL, Vertices
@@ -95,11 +95,11 @@ class GlossyVertices:
     def lit_from(self, directions: Float32[np.ndarray, "n 3"]) -> Vertices:
         """What each W/m² that arrives from directions is worth to the receivers."""
         lobes, there = self.lobes, self.there
-        return replace(there, throughput=ggx.weigh(self._held, lobes.frames, lobes.outgoing, directions, there.throughput))
+        return replace(there, throughput=weighing.weigh(self._held, lobes.frames, lobes.outgoing, directions, there.throughput))
 
     @cached_property
     def _held(self) -> Float32[np.ndarray, "n 11"]:
-        return ggx.prepared(self.lobes.outgoing, self.lobes.base, self.lobes.gloss)
+        return weighing.prepared(self.lobes.outgoing, self.lobes.base, self.lobes.gloss)
 
     def go_on(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Origins and directions of the paths that survive roulette, their throughput and receivers."""
