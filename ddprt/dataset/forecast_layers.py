@@ -174,7 +174,8 @@ def _constant_by_operator(job: Sampled, emission: Any, emitters: Any, light: np.
     before, begun = job.tracer.rays, time.perf_counter()
     operator = Operator.of(job.tracer, job.atlas, job.atlas.resolution)
     making = time.perf_counter() - begun
-    begun, address = time.perf_counter(), {"seed": job.config.seed, "stream": "emission 0"}
+    begun = time.perf_counter()
+    address: dict[str, Any] = {"seed": job.config.seed, "stream": "emission 0"}
     averaged = operator.averaged(light)
     radiosity = operator.bounce(averaged, **address, bounces=job.bounces).radiosity
     near = replace(operator.near([()], averaged, bounces=job.bounces), shine=emitters.shine)
@@ -182,7 +183,7 @@ def _constant_by_operator(job: Sampled, emission: Any, emitters: Any, light: np.
     begun, before = time.perf_counter(), job.tracer.rays
     choice = choose_rays(operator, radiosity, job.config.transport, near=near, held_out=True, **address)
     choosing = time.perf_counter() - begun
-    return making + 2 * bouncing + choosing + choice.seconds, 2 * traced + job.tracer.rays - before + choice.traced
+    return making + 2 * bouncing + choosing + choice.seconds, float(2 * traced + job.tracer.rays - before + choice.traced)
 
 
 def _constant_by_paths(job: Sampled, emission: Any, emitters: Any, light: np.ndarray) -> tuple[float, float]:
@@ -232,4 +233,4 @@ def _constant_of_probes(job: Sampled, emitters: Any, light: np.ndarray) -> tuple
     (_, cold, _), few, many = found
     whole = [on_a_line((few[0], few[k]), (many[0], many[k]), len(position)) for k in (1, 2)]
     write_light(job.folder, NAME, "constant", np.zeros((len(layer.weight), layer.coefficients, 3), np.float32), job.manifest)
-    return whole[0] + max(0.0, cold - few[1]), whole[1]
+    return whole[0] + max(0.0, cold - few[1]), float(whole[1])

@@ -191,6 +191,7 @@ def between(table: np.ndarray, roughness: float, cosine: float, f0: float) -> fl
 
 @compiled
 def between_means(means: np.ndarray, roughness: float, f0: float) -> float:
+    """The same of light from everywhere."""
     row = np.sqrt((max(roughness, SMOOTHEST) - SMOOTHEST) / (1 - SMOOTHEST)) * (len(means) - 1)
     r = min(int(row), len(means) - 2)
     down = row - r
