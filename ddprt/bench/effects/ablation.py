@@ -120,7 +120,16 @@ def ablation(config: Config, folder: Path, progress: Progress) -> list[Row]:
                         rays[index], data[index] = sum(int(s.get("rays", 0)) for s in own.stages), baked
                     stage.advance()
         rows = [
-            _row(variant, scene, lightings["test"], data[0], data[index], median(seconds[index]), rays[index])
+            _row(
+                variant,
+                scene,
+                lightings["test"],
+                data[0],
+                data[index],
+                median(seconds[index]),
+                rays[index],
+                config.probes.asked,
+            )
             for index, variant in enumerate(found)
         ]
     about = {"schema": SCHEMA, "config": config.to_toml(), "environment": environment()}
@@ -166,9 +175,16 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def _row(
-    variant: Variant, scene: Scene, lightings: Sequence[Lighting], planned: Dataset, other: Dataset, seconds: float, rays: int
+    variant: Variant,
+    scene: Scene,
+    lightings: Sequence[Lighting],
+    planned: Dataset,
+    other: Dataset,
+    seconds: float,
+    rays: int,
+    probes: str,
 ) -> Row:
-    decided = plan(variant.scene(scene), lightings, bounces=variant.bounces)
+    decided = plan(variant.scene(scene), lightings, bounces=variant.bounces, probes=probes)
     effect = next((effect for effect in decided.effects if effect.name == variant.effect), None)
     indices = planned.split("test")
     weight = planned.area[:, None] / planned.area.sum()
