@@ -6,16 +6,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ddprt import warp
 from ddprt.lights import Lighting, parse_lighting
 from ddprt.scene.atlas import Atlas, build_atlas
 from ddprt.scene.library import build
 from ddprt.scene.material import Emission, Gloss, Material
 from ddprt.scene.mesh import Scene
-from ddprt.scene.shapes import box
+from ddprt.scene.shapes import box, faceted, rectangle
 from ddprt.sections import TransportConfig
 from ddprt.transport import emission
 from ddprt.transport.effects import force
 from ddprt.transport.embree import Tracer
+from ddprt.transport.gloss import Lobes
 from ddprt.transport.glossiness import scattering
 from ddprt.transport.reference import on_texels, trace_reference
 
@@ -92,3 +94,29 @@ def test_constant_light_beside_gloss_is_that_of_the_reference(
     for other in (diffuse, black):
         assert np.abs(other).max() > 5, "what this cannot tell apart it does not test"
     assert abs(black.mean()) > 1
+
+
+@pytest.mark.parametrize(("roughness", "metallic"), [(0.15, 1.0), (0.6, 0.5)])
+def test_a_lobe_sends_out_the_integral_over_what_glows(roughness: float, metallic: float) -> None:
+    """One place under a panel 1 m away, by quadrature over it: both techniques matter, for a narrow lobe and a wide one."""
+    panel = rectangle((-0.5, -0.5), (0.5, 0.5), 1.0, 1, facing=-1)
+    scene = faceted("panel", panel[None], (Material("panel", (0.5,) * 3, emission=Emission(RADIANCE)),), np.array([0]))
+    emitters, tracer, count = emission.Emitters.of(scene), Tracer.of(scene, 1), 1 << 15
+    normals = np.tile(np.array([0, 1, 0], np.float32), (count, 1))
+    towards = np.array([0.3, 0.9, 0.2]) / np.linalg.norm([0.3, 0.9, 0.2])
+    frames = warp.frame(normals)
+    outgoing = np.einsum("nij,j->ni", frames, towards).astype(np.float32)
+    finish = np.tile(np.array([roughness, metallic, 0.04], np.float32), (count, 1))
+    lobes = Lobes(frames, outgoing, np.full((count, 3), 0.8, np.float32), finish)
+    origins = np.tile((np.zeros(3) - tracer.centre).astype(np.float32), (count, 1))
+    found = emitters.irradiance(tracer, origins, normals, np.random.default_rng(0).random((count, 5), np.float32), lobes)
+    x, z = (part.ravel() for part in np.meshgrid(*2 * [(np.arange(128) + 0.5) / 128 - 0.5]))
+    away = np.stack([x, np.ones_like(x), z], 1)
+    squared = (away**2).sum(1)
+    directions = (away / np.sqrt(squared)[:, None]).astype(np.float32)
+    some = lobes.part(slice(0, len(x)))
+    worth = np.pi * some.reflected(directions).astype(float) * (squared**-1.5)[:, None] / len(x)
+    expected = worth.sum(0) * RADIANCE
+    error = found.std(0) / np.sqrt(count)
+    assert (error < 0.01 * expected).all()
+    assert (np.abs(found.mean(0) - expected) < 5 * error + 1e-3 * expected).all()  # cells are 1 / 128 of a metre
