@@ -199,19 +199,19 @@ def test_the_bright_part_there_and_back(patchwork: Path) -> None:
 
 @pytest.mark.parametrize("normal", [None, UP, np.array([0.48, -0.6, 0.64])], ids=["none", "up", "aside"])
 def test_both_techniques_together_fit_their_density(patchwork: Path, normal: np.ndarray | None) -> None:
-    """Directions against share * bright + (1 - share) * cosine, and light against radiance over that very density."""
+    """Directions against share * bright + (1 - share) * cosine, and light against each one's part of radiance over its density."""
     found, turn = load_sky(str(patchwork)), 75.0
     assert found.share == 0.5
     assert load_sky("gradient").share == load_sky("white").share == 0
     towards, light = drawn(sky(str(patchwork), rotation_deg=turn), normal, 200_000, seed=3)
 
-    def density(there: np.ndarray) -> np.ndarray:
+    def densities(there: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         rest = np.full(len(there), 1 / (4 * np.pi)) if normal is None else np.maximum(there @ normal, 0) / np.pi
-        return found.share * pdf_bright(found, there @ about_y(turn)) + (1 - found.share) * rest
+        return found.share * pdf_bright(found, there @ about_y(turn)), (1 - found.share) * rest
 
     fine = 8
     unturned, solid_angle = directions(*found.radiance.shape[:2], fine)
-    shares = solid_angle * density(unturned.reshape(-1, 3) @ about_y(turn).T).reshape(solid_angle.shape)
+    shares = solid_angle * sum(densities(unturned.reshape(-1, 3) @ about_y(turn).T)).reshape(solid_angle.shape)
     height, width = found.radiance.shape[:2]
     shares = shares.reshape(height, fine, width, fine).sum((1, 3))
     assert shares.sum() == pytest.approx(1, abs=1e-3)  # the horizon cuts through fine pixels
@@ -221,9 +221,15 @@ def test_both_techniques_together_fit_their_density(patchwork: Path, normal: np.
         (np.arccos(np.clip(towards[:, 1], -1, 1)) / np.pi * height,
          ((np.arctan2(*(towards @ about_y(turn)).T[[0, 2]] * [[1], [-1]]) / (2 * np.pi) + 0.5) % 1) * width),
         (height, width), strict=True))  # fmt: skip
-    expected = found.radiance[row, column] / density(towards)[:, None]
+    luminance = found.radiance[row, column] @ LUMINANCE
+    from_bright = np.random.default_rng(3).random((200_000, 2))[:, 0] < found.share
+    part = np.where(from_bright, np.maximum(luminance - found.mean, 0), np.minimum(luminance, found.mean))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        expected = found.radiance[row, column] * (part / luminance / np.where(from_bright, *densities(towards)))[:, None]
+    expected[luminance == 0] = 0
     edge = abs(expected - light).max(1) > 1e-9 * (1 + expected.max(1))
     assert edge.mean() < 1e-3, "but for samples on the very edge of a pixel"
+    assert 0.4 < from_bright.mean() < 0.6
 
 
 def test_samples_are_spent_on_the_sun_and_on_what_faces_the_surface() -> None:
