@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,20 @@ from ddprt.cli import main
 from ddprt.config import load_config
 from ddprt.dataset.splits import doubt
 from ddprt.errors import UserError
-from ddprt.lights import EnvironmentLight, parse_lighting
+from ddprt.lights import EnvironmentLight, Lighting, parse_lighting
 from ddprt.lights.panorama import SKIES, read_panorama
-from ddprt.lights.sky import LUMINANCE, Sky, invert_bright, load_sky, pdf_bright, sample_bright
+from ddprt.lights.sky import (
+    LUMINANCE,
+    Sky,
+    _half_turns_down,
+    _pixel,
+    _spun,
+    _turns_of,
+    invert_bright,
+    load_sky,
+    pdf_bright,
+    sample_bright,
+)
 from ddprt.sampling.lightings import draw_lightings
 from ddprt.scene.atlas import Atlas, build_atlas
 from ddprt.scene.checks import checked
@@ -199,7 +211,7 @@ def test_the_bright_part_there_and_back(patchwork: Path) -> None:
 
 @pytest.mark.parametrize("normal", [None, UP, np.array([0.48, -0.6, 0.64])], ids=["none", "up", "aside"])
 def test_both_techniques_together_fit_their_density(patchwork: Path, normal: np.ndarray | None) -> None:
-    """Directions against share * bright + (1 - share) * cosine, and light against each one's part of radiance over its density."""
+    """Directions against share * bright + (1 - share) * cosine, and light against each one's part over its density."""
     found, turn = load_sky(str(patchwork)), 75.0
     assert found.share == 0.5
     assert load_sky("gradient").share == load_sky("white").share == 0
@@ -244,6 +256,56 @@ def test_samples_are_spent_on_the_sun_and_on_what_faces_the_surface() -> None:
     # Light alone gives 1.09 and 1.02, the cosine alone 0.24 and 13 (docs/effects.md): both techniques are at work.
     assert deviation("gradient") < 0.6
     assert deviation("sun-sky") < 0.6
+
+
+@pytest.mark.parametrize("normal", [None, UP])
+def test_no_direction_outweighs_the_others(normal: np.ndarray | None) -> None:
+    """A sample brings the bright part's flux over its share, or at most the mean over the density of the rest; never both."""
+    found = load_sky("sun-sky")
+    towards, light = drawn(sky("sun-sky"), normal, 1 << 16)
+    share = found.share
+    from_bright = np.random.default_rng(0).random((1 << 16, 2))[:, 0] < share
+    brought = light @ LUMINANCE * (1 if normal is None else np.abs(towards @ normal))
+    whole = 4 * np.pi if normal is None else np.pi
+    np.testing.assert_allclose((light @ LUMINANCE)[from_bright], found.bright / share, rtol=1e-12)
+    assert brought[~from_bright].max() <= found.mean * whole / (1 - share) * (1 + 1e-12)
+    hit = found.radiance[*_pixel(found, towards)[:2]].max(1) > 700
+    assert hit[~from_bright].any(), "of 32768 directions some hit the sun, a thousandth of the sphere"
+
+
+def test_angles_are_as_exact_as_said() -> None:
+    rng = np.random.default_rng(0)
+    x, z = rng.normal(size=(2, 2000))
+    x[:8], z[:8] = [0, 0, 1, -1, 1e-9, -1e-9, 1, 1], [1, -1, 0, 0, 1, -1, 1, -1]
+    found = np.array([_turns_of(*pair) for pair in zip(x.tolist(), z.tolist(), strict=True)])
+    away = abs(found - np.arctan2(x, z) / (2 * np.pi))
+    assert np.minimum(away, 1 - away).max() < 5e-10
+    y = np.concatenate([[-1, 0, 1, 1 - 1e-16, 1e-9 - 1], rng.uniform(-1, 1, 2000)])
+    down = [_half_turns_down(height) for height in y.tolist()]
+    np.testing.assert_allclose(down, np.arccos(y) / np.pi, rtol=0, atol=1e-8)
+    turns = rng.uniform(-3, 3, 2000)
+    np.testing.assert_allclose(
+        [_spun(turn) for turn in turns.tolist()],
+        np.stack([np.cos(2 * np.pi * turns), np.sin(2 * np.pi * turns)], 1),
+        atol=1e-14,
+    )
+
+
+def test_bits_do_not_depend_on_the_threads() -> None:
+    scene = build("statue", subdivisions=2)
+    maps = []
+    for threads in (1, 2):
+        tracer = Tracer.of(scene, threads)
+        texels = Texels.of(tracer, build_atlas(scene, 24, 2), 16, seeds.stream(0, "a"))
+        lightings = [parse_lighting(sky("sun-sky", rotation_deg=turn)) for turn in (0.0, 50.0, 100.0, 150.0)]
+        work = partial(_one, texels)
+        maps.append(np.array(list(tracer.map(work, enumerate(lightings)))))
+    np.testing.assert_array_equal(*maps)
+
+
+def _one(texels: Texels, numbered: tuple[int, Lighting]) -> np.ndarray:
+    index, lighting = numbered
+    return texels.irradiance(lighting, seeds.stream(1, "b", index))
 
 
 @pytest.mark.parametrize("samples", [2, 4, 16, 64])

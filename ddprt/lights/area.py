@@ -21,8 +21,8 @@ _THIN = 1e-6
 class RectLight(LightModel):
     """A parallelogram that emits along half_u x half_v, radiance in W/(m² sr); its back is dark.
 
-    Sampled uniformly by area: E = mean of L * area * cos_light / r². From points near to it, where that varies without bound, and
-    if its sides are square to each other, uniformly by solid angle: E = mean of L * solid angle.
+    Sampled uniformly by area: E = mean of L * area * cos_light / r². From points near to it, where that varies without bound,
+    and if its sides are square to each other, uniformly by solid angle: E = mean of L * solid angle.
     """
 
     kind: ClassVar[str] = "rect"
@@ -142,7 +142,9 @@ def pdf_rectangle(x: np.ndarray, y: np.ndarray, z: float, at: Float64[np.ndarray
 
 def invert_rectangle(x: np.ndarray, y: np.ndarray, z: float, at: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 2"]:
     """The uniform numbers that give these points."""
-    s = np.array([_solid_angle(x[0], end, y[0], y[1], z) for end in at[:, 0].tolist()]) / _solid_angle(x[0], x[1], y[0], y[1], z)
+    s = np.array([_solid_angle(x[0], end, y[0], y[1], z) for end in at[:, 0].tolist()]) / _solid_angle(
+        x[0], x[1], y[0], y[1], z
+    )
     across = np.hypot(at[:, 0], z)
     low, here, high = (end / np.hypot(across, end) for end in (y[0], at[:, 1], y[1]))
     return np.stack([s, (here - low) / (high - low)], -1)

@@ -7,12 +7,11 @@ that fits it:
   brings the same light but for the cosine;
 - the rest, at most the mean: cosine-weighted directions about the normal, or uniform ones where no normal is known.
 
-Neither looks at the other's part, so no direction found by chance outweighs the others: with the balance heuristic in its place
-(Veach 1997, 9.2.4) a direction of the cosine that hits the sun brings some 16 times what its neighbours bring. Half of the samples
-are drawn for each: groups of any even number then divide evenly, and on that noise hangs where all samples are spread evenly. A
-sky that is nowhere four times as bright as its mean is left to the cosine whole. That the mean is taken off is MIS compensation
-(Karlik, Sik, Vevoda, Skrivan and Krivanek, "MIS Compensation", SIGGRAPH Asia 2019), carried to its end. docs/effects.md says
-what each of these gains.
+Neither looks at the other's part, so no direction found by chance outweighs the others, as one of the cosine that hits the sun
+would under the balance heuristic (Veach 1997, 9.2.4). Half of the samples are drawn for each: groups of any even number then
+divide evenly, and on that noise hangs where all samples are spread evenly. A sky that is nowhere four times as bright as its
+mean is left to the cosine whole. That the mean is taken off is MIS compensation (Karlik, Sik, Vevoda, Skrivan and Krivanek,
+"MIS Compensation", SIGGRAPH Asia 2019), carried to its end. docs/effects.md says what each of these gains.
 """
 
 from dataclasses import dataclass
@@ -284,7 +283,12 @@ def _shine(
     height, width = radiance.shape[0], radiance.shape[1]
     pixels, count = radiance.reshape(-1, 3), u.shape[1]
     drawn, rest = np.empty(_STRIP, np.int64), np.empty(_STRIP, np.int64)
-    numbers, facing, towards, pixel = np.empty((2, _STRIP)), np.zeros((3, _STRIP)), np.empty((4, _STRIP)), np.empty(_STRIP, np.int64)
+    numbers, facing, towards, pixel = (
+        np.empty((2, _STRIP)),
+        np.zeros((3, _STRIP)),
+        np.empty((4, _STRIP)),
+        np.empty(_STRIP, np.int64),
+    )
     for first in range(0, count, _STRIP):
         bright_ones = others = 0
         for i in range(first, min(first + _STRIP, count)):  # written always and kept by counting, as in `direct`

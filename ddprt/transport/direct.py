@@ -209,8 +209,8 @@ def _given(numbers: Float32[np.ndarray, "n 2"], first: int, u: Float32[np.ndarra
 def _sequence(samples: int) -> Float32[np.ndarray, "2 samples"]:
     """Places spread over the unit square: x -> x + (root of 2, root of 3) modulo 1.
 
-    No whole multiples of these two and of the golden ratio add up to a whole number, so that a texel's places and the parts of
-    a light that they meet (`_lattice`) are spread over all four dimensions. Were both drawn by one sequence they would move in step.
+    No whole multiples of these two and of the golden ratio add up to a whole number, so that a texel's places and the parts
+    of a light that they meet (`_lattice`) are spread over all four dimensions. By one sequence both would move in step.
 
     Reference: Niederreiter, "Random Number Generation and Quasi-Monte Carlo Methods", 1992, 5.
     """
