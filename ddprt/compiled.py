@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import numba
 from llvmlite import ir
-from numba.core import cgutils, types
+from numba.core import cgutils
 from numba.extending import intrinsic
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -31,11 +31,11 @@ def compiled(function: Function) -> Function:
 
 def _called(context: Any, address: Any, words: Any) -> Any:
     def written(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        shape = ir.FunctionType(ir.VoidType(), [ir.IntType(types.intp.bitwidth)] * len(words))
+        shape = ir.FunctionType(ir.VoidType(), [ir.IntType(numba.types.intp.bitwidth)] * len(words))
         builder.call(builder.inttoptr(given[0], shape.as_pointer()), cgutils.unpack_tuple(builder, given[1]))
         return context.get_dummy_value()
 
-    return types.void(types.intp, types.UniTuple(types.intp, len(words))), written
+    return numba.types.void(numba.types.intp, numba.types.UniTuple(numba.types.intp, len(words))), written
 
 
 call_at = intrinsic(unwrap(_called))

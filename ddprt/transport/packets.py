@@ -1,8 +1,9 @@
 """The only door to Embree: triangles that it knows, and rays handed to it in packets.
 
 embreex, which brings the library, hands rays over one by one. Here its C interface is used directly, from compiled loops. On
-the same machine both give the same bits. Packets are as wide as the processor takes at once, but of eight rays at most: sixteen
-were slower but for a single lamp in an almost empty room (docs/baking.md).
+the same machine both give the same bits, but for shadow rays that pass the rim of a surface within rounding: a packet may let
+them by. Packets are as wide as the processor takes at once, but of eight rays at most: sixteen are slower but for a single lamp
+in an almost empty room (docs/baking.md).
 """
 
 import ctypes
@@ -104,7 +105,7 @@ def _check(calls: ctypes.CDLL, device: int | None, wanted: str) -> None:
     """Raises what Embree has noted since it was last asked in this thread."""
     if code := calls.rtcGetDeviceError(device):
         reason = (calls.rtcGetDeviceLastErrorMessage(device) or b"no reason").decode(errors="replace")
-        raise UserError(f"Embree: got error {code} ({reason}), expected {wanted}; see that there is memory for it")
+        raise UserError(f"Embree: got error {code} ({reason}), expected {wanted}; take a smaller scene if memory is short")
 
 
 class Geometry:
@@ -233,4 +234,4 @@ def _occlude(
         count = _load(packet, first, origins, directions, reach)
         call_at(function, words)
         for k in range(count):
-            seen[first + k] = packet[_END, k] >= 0  # minus infinity where a ray is stopped
+            seen[first + k] = not packet[_END, k] < 0  # minus infinity where a ray is stopped
