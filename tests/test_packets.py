@@ -195,6 +195,12 @@ def test_every_number_of_rays() -> None:
         np.testing.assert_array_equal(reach, np.where(np.arange(40) < count, whole[3], np.float32(FAR)))
 
 
+def test_what_is_left_of_a_packet_is_not_traced() -> None:
+    rays, packet = random_rays(19, 7), packets._packet(8)
+    assert [packets._load(packet, first, *rays) for first in (0, 8, 16)] == [8, 8, 3]
+    assert packet[packets._VALID].view(np.int32).tolist() == [-1] * 3 + [0] * 5
+
+
 def test_shadow_rays_leave_their_reach_as_it_is() -> None:
     rays = random_rays(1000, 8)
     before = rays[2].copy()
