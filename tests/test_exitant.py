@@ -90,7 +90,7 @@ def test_in_a_furnace_a_surface_sends_out_its_albedo(part: Gloss, atlas: Atlas, 
     monkeypatch.setattr(Lit, "arriving", white)
     scene = vase(part)
     runs = []
-    for k in range(8):
+    for k in range(16):
         exits, found = sent(scene, atlas, [LAMP], 64, stream=f"{k}")
         runs.append(found[0].astype(float))
     # Albedo at 48 Gauss nodes of cosine, each by as many rings of 192; lobes are wide enough for that.
@@ -122,11 +122,10 @@ def test_in_a_furnace_a_surface_sends_out_its_albedo(part: Gloss, atlas: Atlas, 
     off = (np.mean(runs, 0) - exact)[..., GREEN]
     z_scores = off / pooled[:, GREEN]
     assert pooled.max() < 0.05
-    assert z_scores.std() < 1.1  # and below 1 where harmonics vanish on some texels, and have no error there
-    # The largest of some thousand scores, and 2e-4 that quadrature and the table of albedos leave (tests/test_ggx.py).
+    assert z_scores.std() < 1.2  # 45 texels of one net; below 1 where harmonics vanish on some of them
+    # The largest of some thousand scores; and 2e-3 that quadrature and the table of albedos leave (tests/test_ggx.py).
     assert (np.abs(off) < 6 * pooled[:, GREEN] + 2e-3).all()
-    bias = off[:, 0].mean()
-    assert abs(bias) < 4 * pooled[0, GREEN] / np.sqrt(exits.count) + 2e-3
+    assert (np.abs(off.mean(0)) < 4.5 * pooled[:, GREEN] / np.sqrt(exits.count) + 1e-4).all()
 
 
 def test_a_rough_dielectric_sends_out_what_a_white_wall_would(atlas: Atlas) -> None:
