@@ -137,7 +137,7 @@ class GlossBake:
             if noise > 1.5 * config.target_noise:
                 setting = f"transport.{'test_' if split == 'test' else ''}samples"
                 progress.warn(
-                    f"{self.layer.name}: {given} paths per glossy texel leave about {100 * noise:.2g} % of noise in what leaves "
+                    f"{self.layer.name}: {given} paths per glossy texel leave {100 * noise:.2g} % of noise in what leaves "
                     f"it, and no more are traced unasked; set {setting} or raise transport.target_noise"
                 )
         samples = max(1, given // halves)
