@@ -224,6 +224,7 @@ def test_bits_do_not_depend_on_threads_nor_on_the_batch(room: Scene, atlas: Atla
     _, one = sent(room, atlas, [LAMP, PANEL], 128, threads=1)
     _, three = sent(room, atlas, [PANEL, LAMP], 128, threads=3)
     np.testing.assert_array_equal(one, three[::-1])
+    np.testing.assert_array_equal(one[1:], sent(room, atlas, [PANEL], 128)[1])
     assert np.isfinite(one).all()
 
 
