@@ -50,7 +50,9 @@ def _scores(data: Dataset, part: LayerModel) -> dict[str, Any]:
     }
     if layer.quantity == "radiance" and (layer.texel >= 0).all():
         light = part.predict(values, lightings=lightings)
-        found["seen_relative_rmse"] = _seen(layer, light, reference.reshape(light.shape), data.gbuffer["geometric_normal"][layer.texel])
+        found["seen_relative_rmse"] = _seen(
+            layer, light, reference.reshape(light.shape), data.gbuffer["geometric_normal"][layer.texel]
+        )
     basis = getattr(model.relighter, "basis", None)
     if basis is None or len(basis) == 0:
         return found
@@ -65,9 +67,7 @@ def _scores(data: Dataset, part: LayerModel) -> dict[str, Any]:
     return found
 
 
-def _seen(
-    layer: Layer, ours: np.ndarray, reference: np.ndarray, normal: Float32[np.ndarray, "places 3"]
-) -> float | None:
+def _seen(layer: Layer, ours: np.ndarray, reference: np.ndarray, normal: Float32[np.ndarray, "places 3"]) -> float | None:
     """RMSE of what eyes see in directions that are spread evenly, over the mean of the reference; None where that is dark."""
     square = total = whole = 0.0
     for direction in warp.sample_sphere(warp.sobol(_DIRECTIONS, 2, seed=0)).astype(np.float64):

@@ -17,6 +17,7 @@ from ddprt.axes import Bool, Float, Float32, Float64, Int
 from ddprt.dataset.layers import Layer
 from ddprt.harmonics import harmonics
 from ddprt.lights import EnvironmentLight, Lighting
+from ddprt.lights.light import unit
 from ddprt.report.lamps import seen_lamps
 from ddprt.report.view import Camera, Rays, look_up, nearest_texels, seen, triple
 from ddprt.scene.mesh import Scene
@@ -297,7 +298,7 @@ def _balls(tracer: Tracer, rays: Rays, ends: Float64[np.ndarray, " rays"], layer
         half = 1.5 * radius / (depth - radius) / (2 * rays.camera.reach)
         low, high = (np.clip((middle + sign * half) * finer, 0, finer).astype(int) for sign in (-1, 1))
         box = slice(low[1], high[1] + 1), slice(low[0], high[0] + 1)
-        towards = directions[box].astype(np.float64)
+        towards = unit(directions[box].astype(np.float64))
         along = towards @ away
         under = along**2 - (away @ away - radius**2)
         distance = along - np.sqrt(np.maximum(under, 0))
@@ -307,9 +308,8 @@ def _balls(tracer: Tracer, rays: Rays, ends: Float64[np.ndarray, " rays"], layer
         ray = ray[nearer]
         ends[ray], probe[ray] = distance[row, column][nearer], index
     mine = np.flatnonzero(probe >= 0)
-    position = eye + ends[mine, None] * rays.directions[mine].astype(np.float64)
-    normal = position - layer.position[probe[mine]]
-    return Balls(mine, probe[mine], position, normal / np.linalg.norm(normal, axis=1, keepdims=True))
+    position = eye + ends[mine, None] * unit(rays.directions[mine].astype(np.float64))
+    return Balls(mine, probe[mine], position, unit(position - layer.position[probe[mine]]))
 
 
 def _radius(tracer: Tracer, position: Float[np.ndarray, "probes 3"]) -> float:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ddprt.axes import Float64
-from ddprt.dataset.layers import read_light
+from ddprt.dataset.layers import Layer, read_light
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.report.evaluate import Evaluation
@@ -21,7 +21,7 @@ from ddprt.transport.embree import Tracer
 Eye = tuple[float, float, float]
 
 
-def cameras(scene: Scene, tracer: Tracer, eyes: Sequence[Eye], model: Model) -> list[Camera]:
+def cameras(scene: Scene, tracer: Tracer, eyes: Sequence[Eye], layers: Sequence[Layer]) -> list[Camera]:
     """From where the scene is shown: from given places (metres) towards the middle of its default picture.
 
     Where none is given, as in the default picture, and from two places near to what is glossy.
@@ -31,7 +31,7 @@ def cameras(scene: Scene, tracer: Tracer, eyes: Sequence[Eye], model: Model) -> 
     """
     first = default_camera(scene)
     if not eyes:
-        return [first, *close_cameras(tracer, first, [part.layer for part in model.layers.values()])]
+        return [first, *close_cameras(tracer, first, layers)]
     found = []
     for eye in eyes:
         away = np.subtract(first.target, eye)
@@ -74,7 +74,7 @@ def shots(
     picked = chosen(errors)
     views = [
         Scenery.of(tracer, scene, uv, data.covered, camera, layers)
-        for camera in (cameras(scene, tracer, eyes, model) if picked else [])
+        for camera in (cameras(scene, tracer, eyes, layers) if picked else [])
     ]
     rows = []
     for row, label in picked:
