@@ -12,6 +12,7 @@ from ddprt import seeds
 from ddprt.axes import Float32, Int
 from ddprt.config import Config
 from ddprt.dataset.denoise import denoised
+from ddprt.dataset.gloss import GlossBake
 from ddprt.dataset.manifest import Manifest, map_name
 from ddprt.dataset.probes import ProbeBake, Sent
 from ddprt.dataset.sampled import scratched, stored
@@ -62,11 +63,18 @@ class IndirectBake:
         if self._probes:
             dark = self.config.transport.bounces == 0 or not any(max(entry.albedo) for entry in self.scene.materials)
             self._probes.run(split, indices, sent, self.progress, dark=dark)
+        for layer in self._glossy:
+            layer.run(split, indices, self.progress)
 
     @cached_property
     def _probes(self) -> ProbeBake | None:
         scene = self.scene, self.tracer, self.atlas
         return ProbeBake.of(self.effects, self.config, *scene, self.dataset, self.manifest)
+
+    @cached_property
+    def _glossy(self) -> tuple[GlossBake, ...]:
+        scene = self.scene, self.tracer, self.atlas
+        return GlossBake.all(self.config, *scene, self.dataset, self.manifest, bounces=self.effects.bounces)
 
     def _maps(self, split: str, indices: list[int], sent: Callable[[int], Sent]) -> None:
         kinds = ["indirect", "noise"] if split == "test" else ["indirect"]

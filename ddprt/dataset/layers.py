@@ -6,7 +6,7 @@ coefficients are entries as texels are, so basis and transfer stay what they are
 of texels alone.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -76,6 +76,25 @@ def write_light(folder: Path, layer: str, index: int, light: np.ndarray, manifes
         raise UserError(f"{name}: got light past the range of float32; lower the intensities or keep lamps off the surfaces")
     write_tensors(folder / name, {kind: light.astype(np.float32)})
     manifest.add(name)
+
+
+def write_halves(
+    folder: Path,
+    layer: str,
+    indices: Sequence[int],
+    halves: Callable[[int], Sequence[np.ndarray]],
+    manifest: Manifest,
+) -> None:
+    """Coefficients of lightings: what `halves` gives for one, or of two the mean as "light" and half the difference as "noise".
+
+    Raises:
+      UserError: not finite.
+    """
+    for index in indices:
+        parts = halves(index)
+        write_light(folder, layer, index, parts[0] if len(parts) == 1 else (parts[0] + parts[1]) / 2, manifest)
+        if len(parts) > 1:
+            write_light(folder, layer, index, (parts[0] - parts[1]) / 2, manifest, "noise")
 
 
 def read_layer(data: Dataset, name: str) -> Layer:

@@ -1,0 +1,164 @@
+"""Layers of glossy texels in a dataset: what the eye sees on them, indirect light that leaves towards every direction.
+
+One layer for each order of harmonics that occurs, so that a rough metal beside a smooth one pays only for itself. Held-out
+lightings are the mean of two independent halves, with half their difference as "noise", as in the lightmap. Nothing of the
+simulation is imported where nothing glosses.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from ddprt import harmonics
+from ddprt.config import Config
+from ddprt.dataset.layers import Layer, read_layer, write_halves, write_places
+from ddprt.dataset.manifest import Manifest, layer_lacks, layer_name
+from ddprt.dataset.scratch import Scratch
+from ddprt.dataset.store import Dataset
+from ddprt.errors import UserError
+from ddprt.progress import Progress, Stage
+from ddprt.scene.atlas import Atlas
+from ddprt.scene.mesh import Scene
+from ddprt.transport.embree import Tracer
+from ddprt.transport.glossiness import glossy
+
+
+def _simulation(scene: Scene) -> ModuleType | None:
+    return import_module("ddprt.transport.exitant") if any(glossy(scene)) else None
+
+
+def gloss_layers(scene: Scene) -> list[dict[str, Any]]:
+    """What dataset.json tells of glossy texels; empty where none is simulated."""
+    module = _simulation(scene)
+    return [_entry(order) for order in module.orders(scene)] if module else []
+
+
+def _entry(order: int) -> dict[str, Any]:
+    return {"name": f"gloss-{order}", "quantity": "radiance", "order": order}
+
+
+@dataclass(frozen=True, eq=False)
+class GlossBake:
+    """What is needed to bake the layer of one order.
+
+    Attributes:
+      module: of the simulation.
+      exits: the places, as it knows them.
+      layer: the same, as the dataset keeps them.
+      config, scene, tracer, dataset, manifest, bounces: of the bake.
+    """
+
+    module: ModuleType
+    exits: Any
+    layer: Layer
+    config: Config
+    scene: Scene
+    tracer: Tracer
+    dataset: Dataset
+    manifest: Manifest
+    bounces: int
+
+    @classmethod
+    def all(
+        cls,
+        config: Config,
+        scene: Scene,
+        tracer: Tracer,
+        atlas: Atlas,
+        dataset: Dataset,
+        manifest: Manifest,
+        *,
+        bounces: int,
+    ) -> "tuple[GlossBake, ...]":
+        """Finds the glossy texels and writes where they are, unless that is there; empty where nothing glosses.
+
+        Raises:
+          UserError: glossy materials of an order are nowhere in the open.
+        """
+        module, found = _simulation(scene), list[GlossBake]()
+        for entry in gloss_layers(scene):
+            exits = module.Exits.of(scene, atlas, entry["order"])  # type: ignore[union-attr]
+            if not exits.count:
+                users = module.orders(scene)[entry["order"]]  # type: ignore[union-attr]
+                named = ", ".join(f'"{scene.materials[index].name}"' for index in users)
+                raise UserError(
+                    f"material {named}: got gloss on surfaces that cover no texel in the open, expected some; move them there, "
+                    "or make the material diffuse"
+                )
+            if not manifest.holds(layer_name(entry["name"], "places")):
+                layer = Layer(**entry, position=atlas.position[exits.texel], weight=exits.weight, texel=exits.texel)
+                write_places(dataset.folder, layer, manifest)
+            layer = read_layer(dataset, entry["name"])
+            assert module is not None
+            found.append(cls(module, exits, layer, config, scene, tracer, dataset, manifest, bounces))
+        return tuple(found)
+
+    def run(self, split: str, indices: Sequence[int], progress: Progress) -> None:
+        """Bakes the layer of a split's lightings where some are missing: "train" (with validation) or "test"."""
+        kinds = ("light", "noise")[: 1 + (split == "test")]
+        todo = layer_lacks(self.manifest, self.layer.name, kinds, indices)
+        if not todo:
+            return
+        with progress.stage(f"gloss {split}, order {self.layer.order}") as stage:
+            before, count, parts = self.tracer.rays, self.exits.count, []
+            stage.facts |= {"texels": count}
+            if self.bounces == 0:
+                dark = np.zeros((count, self.layer.coefficients, 3), np.float32)
+                write_halves(self.dataset.folder, self.layer.name, todo, lambda index: [dark] * len(kinds), self.manifest)
+            else:
+                lightings = [self.dataset.lightings[index] for index in indices]
+                lit = self.module.Lit.of(self.tracer, self.scene, lightings, self.bounces)
+                samples = self._samples(lit, split, len(kinds), stage, progress)
+                stage.pace(len(kinds) * samples * count)
+                for half in range(len(kinds)):
+                    parts.append(self._traced(lit, f"{split}-{half}", len(indices), samples, stage))
+                shape = count, harmonics.count(self.layer.order), 3
+
+                def halves(index: int) -> list[np.ndarray]:
+                    return [part.maps[indices.index(index)].reshape(shape) for part in parts]
+
+                write_halves(self.dataset.folder, self.layer.name, todo, halves, self.manifest)
+                for part in parts:
+                    part.remove()
+            stage.facts["rays"] = self.tracer.rays - before
+
+    def _samples(self, lit: Any, split: str, halves: int, stage: Stage, progress: Progress) -> int:
+        """Paths of each half and place: as configured, or as the noise that is aimed at asks."""
+        config = self.config.transport
+        given = config.test_samples if split == "test" else config.samples
+        if given == "auto":
+            address = {"seed": self.config.seed, "stream": self._stream(split)}
+            given, noise = self.module.choose_samples(lit, self.exits, target=config.target_noise, **address)
+            stage.facts["noise_expected"] = float(f"{noise:.3g}")
+            if noise > 1.5 * config.target_noise:
+                progress.warn(
+                    f"{self.layer.name}: {given} paths per glossy texel leave about {100 * noise:.2g} % of noise in what it "
+                    f"sends out, and no more are traced unasked; set transport.{'test_' if split == 'test' else ''}samples, raise "
+                    "transport.target_noise, or make the surface rougher"
+                )
+        samples = max(1, given // halves)
+        stage.facts["samples"] = samples * halves
+        return int(samples)
+
+    def _stream(self, part: str) -> str:
+        return f"{self.layer.name} {part}"
+
+    def _traced(self, lit: Any, part: str, lightings: int, samples: int, stage: Stage) -> Scratch:
+        """One half of a split, tile by tile; what an interrupted bake left of it is taken over."""
+        shape = lightings, self.exits.count * self.layer.coefficients, 3
+        path = self.dataset.folder / f"{self.layer.name}-{part}.part"
+        scratch = Scratch(path, shape, {"dataset": self.dataset.description, "layer": self.layer.name, "paths": samples})
+        there, tile = scratch.done, 0
+
+        def told(places: int) -> None:
+            nonlocal tile
+            stage.advance(samples * places, found=tile < there)
+            tile += 1
+
+        address: dict[str, Any] = {"samples": samples, "seed": self.config.seed, "stream": self._stream(part)}
+        scratch.follow(self.module.trace_exitant(lit, self.exits, scratch.maps, skip=scratch.done, **address), told)
+        return scratch
