@@ -153,13 +153,13 @@ def test_glossy_pixels_show_their_layer_towards_the_eye(vase: tuple[Scene, Trace
     rng.shuffle(texel)  # places need not be in the order of the lightmap
     layer = Layer("gloss-2", "radiance", 2, atlas.position[texel], atlas.area[texel], texel)
     scenery = Scenery.of(tracer, scene, atlas.uv, covered, camera, [layer], height=60)
-    slope = np.array([3.0, -0.2, -0.1])
-    light = np.tile(tilted(2, 0.6, slope), (len(texel), 1, 1)).astype(np.float32)
+    slope = np.array([8.0, -0.2, -0.1])
+    light = np.tile(tilted(2, -0.8, slope), (len(texel), 1, 1)).astype(np.float32)
     shown = scenery.learned(np.zeros((atlas.count, 3), np.float32), {"gloss-2": light})
     rays = scenery.rays
     gilt = scene.material == len(scene.materials) - 1
     on_it = (rays.hits.triangle >= 0) & gilt[rays.hits.triangle]
-    value = np.maximum(0.6 - rays.directions.astype(np.float64) @ slope, 0)  # towards the eye is against the ray
+    value = np.maximum(-0.8 - rays.directions.astype(np.float64) @ slope, 0)  # towards the eye is against the ray
     expected = rays.mean(np.pi * np.where(on_it, value, 0))
     assert on_it.sum() > 500
     assert (value[on_it] == 0).any()
@@ -186,7 +186,9 @@ def test_a_white_sky_in_a_metal_mirror() -> None:
     scenery = Scenery.of(tracer, scene, atlas.uv, atlas.slot >= 0, camera, height=48)
     sky, dark = EnvironmentLight(image="white"), np.zeros((atlas.count, 3), np.float32)
     lit = scenery.lit((sky,), dark)
-    np.testing.assert_allclose(scenery.emitted((sky,))[scenery.rays.mean(np.isinf(scenery.ends).astype(float)) == 1], np.pi, rtol=1e-6)
+    np.testing.assert_allclose(
+        scenery.emitted((sky,))[scenery.rays.mean(np.isinf(scenery.ends).astype(float)) == 1], np.pi, rtol=1e-6
+    )
     assert (scenery.alpha((sky,)) == 1).all()
     rays = scenery.rays
     on_it = rays.hits.triangle >= 0
@@ -196,7 +198,7 @@ def test_a_white_sky_in_a_metal_mirror() -> None:
     error = (lit - expected[..., None])[inside][:, 0]
     # Pixels are independent; the table of albedos is interpolated, to 2e-3 (tests/test_ggx.py).
     assert abs(error.mean()) < 4 * error.std() / np.sqrt(len(error)) + 2e-3 * np.pi
-    assert error.std() < 0.3
+    assert error.std() < 0.05 * np.pi  # the lobe is sampled, too: light's own samples alone leave 0.2 pi
 
 
 def test_a_glowing_sign_shows_its_radiance() -> None:
@@ -250,8 +252,10 @@ def test_probes_are_balls_shaded_by_their_own_normals(cornell: Scene, cornell_at
     found[balls.rays] = WHITE * (cosine / squared)[:, None] * np.array(LAMP.intensity)
     whole = scenery.rays.mean(np.isin(np.arange(len(found)), balls.rays).astype(float)) == 1
     lit = scenery.lit((LAMP,), np.zeros((cornell_atlas.count, 3), np.float32))
-    assert whole.sum() > 20
-    np.testing.assert_allclose(lit[whole], scenery.rays.mean(found)[whole], rtol=1e-3, atol=1e-5)
+    assert whole.sum() > 50
+    # Places are float32 in the room's frame: off by 6e-8 m, which turns a normal of 1 cm by 6e-6 and a cosine by as much.
+    bound = 2 * 6e-6 * WHITE * (np.max(LAMP.intensity) / squared.min())
+    np.testing.assert_allclose(lit[whole], scenery.rays.mean(found)[whole], rtol=1e-4, atol=bound)
 
 
 def test_what_is_nearer_hides_a_ball_and_a_ball_hides_what_is_farther(cornell: Scene, cornell_atlas: Atlas) -> None:

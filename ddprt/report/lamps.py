@@ -40,12 +40,17 @@ def sky_radiance(light: EnvironmentLight, directions: Float64[np.ndarray, "n 3"]
 
     image = load_sky(light.image).radiance
     height, width = image.shape[:2]
-    turn = np.radians(light.rotation_deg)
-    x, y, z = directions.T
-    x, z = x * np.cos(turn) - z * np.sin(turn), x * np.sin(turn) + z * np.cos(turn)  # into the picture's own frame
+    x, y, z = into_picture(light, directions).T
     row = np.minimum((np.arccos(np.clip(y, -1, 1)) / np.pi * height).astype(int), height - 1)
     column = np.minimum(((0.5 + np.arctan2(x, -z) / (2 * np.pi)) % 1 * width).astype(int), width - 1)
     return light.scale * image[row, column].astype(np.float64)
+
+
+def into_picture(light: EnvironmentLight, directions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+    """Directions in the frame of a sky's own picture, before it is turned."""
+    turn = np.radians(light.rotation_deg)
+    x, y, z = directions.T
+    return np.stack([x * np.cos(turn) - z * np.sin(turn), y, x * np.sin(turn) + z * np.cos(turn)], 1)
 
 
 def _distance(

@@ -12,26 +12,23 @@ from importlib import import_module
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from ddprt import seeds
+from ddprt import harmonics
 from ddprt.axes import Bool, Float, Float32, Float64, Int
 from ddprt.dataset.layers import Layer
-from ddprt.harmonics import harmonics
 from ddprt.lights import EnvironmentLight, Lighting
 from ddprt.lights.light import unit
 from ddprt.report.lamps import seen_lamps
+from ddprt.report.mirrored import mirrored
 from ddprt.report.view import Camera, Rays, look_up, nearest_texels, seen, triple
 from ddprt.scene.mesh import Scene
-from ddprt.transport.direct import centred
 from ddprt.transport.embree import Tracer
 from ddprt.transport.glossiness import glossy_surfaces, scattering
 from ddprt.transport.measure import measure
-from ddprt.transport.reference import reflected
 
 WHITE = 0.8
 """Albedo of the balls that probes are shown as."""
 _BALL = 0.16  # radius of a ball over the median distance of a probe from the next
 _LARGEST = 0.03  # of the scene's radius, that of a ball at most
-_SAMPLES = 16  # of lamps with size, for each ray that meets something glossy
 _BLOCK = 1 << 14  # rays whose harmonics are held at once
 _CLOSE = 0.75  # of half a picture, what is glossy fills of a close one
 _ASIDE = (30.0, 50.0, 75.0, 110.0)  # degrees that the eye may step aside for a close picture
@@ -63,7 +60,7 @@ class Shown:
         for first in range(0, len(found), _BLOCK):
             part = slice(first, first + _BLOCK)
             there = (self.lookup[part] @ flat).reshape(-1, *light.shape[1:])
-            found[part] = np.einsum("nkc,nk->nc", there, harmonics(self.directions[part], self.order))
+            found[part] = np.einsum("nkc,nk->nc", there, harmonics.harmonics(self.directions[part], self.order))
         return self.factor * np.maximum(found, 0)
 
 
@@ -217,17 +214,10 @@ class Scenery:
 
     def _reflected(self, lighting: Lighting) -> Float64[np.ndarray, "shiny 3"]:
         """What glossy surfaces send to the eye of lamps and skies, diffuse part and lobe."""
-        rays, tracer = self.met[self.shiny], self.tracer
-        hits, lights = self.rays.hits, centred(tracer, lighting)
+        rays, hits = self.met[self.shiny], self.rays.hits
         where = hits.triangle[rays], hits.u[rays], hits.v[rays]
-        lobes = glossy_surfaces(tracer, self.scene).lobes(*where, self.rays.directions[rays])
-        position, normal = tracer.on_triangle(*where), tracer.normals[where[0]]
-        samples = 1 if all(light.delta for light in lights) else _SAMPLES
-        rng, total = seeds.stream(0, "picture"), np.zeros((len(rays), 3))
-        for _ in range(samples):
-            u = rng.random((len(lights), len(rays), 2), np.float32)
-            total += reflected(tracer, lights, position, normal, lobes, u)
-        return total / samples
+        lobes = glossy_surfaces(self.tracer, self.scene).lobes(*where, self.rays.directions[rays])
+        return mirrored(self.tracer, lighting, self.tracer.on_triangle(*where), self.tracer.normals[where[0]], lobes)
 
 
 def close_cameras(tracer: Tracer, camera: Camera, layers: Sequence[Layer]) -> list[Camera]:
