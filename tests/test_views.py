@@ -195,6 +195,7 @@ def test_a_white_sky_in_a_metal_mirror() -> None:
     cosine = np.where(on_it, -rays.directions[:, 2].astype(float), 1.0)
     expected = rays.mean(np.where(on_it, np.pi * ggx.albedo(cosine, 0.5, 1.0), 0))
     inside = rays.mean(on_it.astype(float)) == 1
+    assert not scenery.emitted((sky,))[inside].any()
     error = (lit - expected[..., None])[inside][:, 0]
     # Pixels are independent; the table of albedos is interpolated, to 2e-3 (tests/test_ggx.py).
     assert abs(error.mean()) < 4 * error.std() / np.sqrt(len(error)) + 2e-3 * np.pi

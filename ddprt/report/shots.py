@@ -87,7 +87,7 @@ def shots(
         for view in views:
             untouched, lit = view.emitted(lighting), view.lit(lighting, direct, data.constant)
             answers = view.learned(predicted[row], ours), view.learned(truth.reference[row], reference)
-            shown.append((view, view.alpha(lighting), untouched, lit, *answers))
+            shown.append((view, view.alpha(()), untouched, lit, *answers))
         # One exposure for all pictures of a lighting; lamps and what glows are left to be clipped.
         exposure = exposure_for(np.concatenate([(lit + true)[alpha > 0] for _, alpha, _, lit, _, true in shown]))
         limit = signed_range(np.concatenate([(mine - true).mean(2)[alpha > 0] for _, alpha, _, _, mine, true in shown]))
@@ -96,10 +96,11 @@ def shots(
         for view, alpha, untouched, lit, mine, true in shown:
             named = {"ours": tonemap(untouched + lit + mine, exposure), "reference": tonemap(untouched + lit + true, exposure)}
             named["difference"] = diverging((mine - true).mean(2), limit)
+            veils = {**dict.fromkeys(named, view.alpha(lighting)), "difference": alpha}
             size = float(true.sum())
             pictures.append(
                 {
-                    **{name: png(np.concatenate([image, alpha[..., None]], 2)) for name, image in named.items()},
+                    **{name: png(np.concatenate([image, veils[name][..., None]], 2)) for name, image in named.items()},
                     "eye": view.rays.camera.eye,
                     "off": float(np.sqrt(np.mean((mine - true) ** 2)) / (size / true.size)) if size > 0 else None,
                     "lamps": on_picture(view.rays.camera, lamps),
