@@ -135,10 +135,10 @@ class GlossBake:
             given, noise = self.module.choose_samples(lit, self.exits, target=config.target_noise, **address)
             stage.facts["noise_expected"] = float(f"{noise:.3g}")
             if noise > 1.5 * config.target_noise:
+                setting = f"transport.{'test_' if split == 'test' else ''}samples"
                 progress.warn(
-                    f"{self.layer.name}: {given} paths per glossy texel leave about {100 * noise:.2g} % of noise in what it "
-                    f"sends out, and no more are traced unasked; set transport.{'test_' if split == 'test' else ''}samples, raise "
-                    "transport.target_noise, or make the surface rougher"
+                    f"{self.layer.name}: {given} paths per glossy texel leave {100 * noise:.2g} % of noise in what leaves "
+                    f"it, and no more are traced unasked; set {setting} or raise transport.target_noise"
                 )
         samples = max(1, given // halves)
         stage.facts["samples"] = samples * halves

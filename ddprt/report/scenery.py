@@ -143,7 +143,7 @@ class Scenery:
         gloss = glossy_surfaces(tracer, scene)
         shiny = np.flatnonzero(gloss.shiny[triangle]) if gloss else np.zeros(0, int)
         exitant = [layer for layer in layers if layer.quantity == "radiance"]
-        shown = [_from_texels(layer, rays, met, place, covered) for layer in exitant]
+        shown = _from_texels(exitant, rays, met[shiny], place[shiny], covered) if len(shiny) else []
         for layer in layers:
             if layer.name in balls:
                 one = balls[layer.name]
@@ -253,23 +253,29 @@ def _distances(tracer: Tracer, rays: Rays) -> Float64[np.ndarray, " rays"]:
 
 
 def _from_texels(
-    layer: Layer,
+    layers: Sequence[Layer],
     rays: Rays,
-    met: Int[np.ndarray, " met"],
-    place: Float64[np.ndarray, "met 2"],
+    shiny: Int[np.ndarray, " shiny"],
+    place: Float64[np.ndarray, "shiny 2"],
     covered: Bool[np.ndarray, "height width"],
-) -> Shown:
-    """Rays that end on the texels of a layer of exitant light."""
-    own = np.zeros(int(covered.sum()), bool)
-    own[layer.texel] = True
-    mine = np.flatnonzero(own[nearest_texels(place, covered)])
-    mask = np.zeros_like(covered)
-    mask[covered] = own
-    # Look-ups count the layer's texels in their order on the lightmap, which need not be that of its places.
-    place_of = np.argsort(layer.texel)
-    found = look_up(place[mine], np.arange(len(mine)), np.ones(len(mine)), len(mine), mask).tocoo()
-    lookup = csr_matrix((found.data, (found.row, place_of[found.col])), found.shape)
-    return Shown(layer.name, met[mine], lookup, -rays.directions[met[mine]].astype(np.float64), layer.order, np.pi)
+) -> list[Shown]:
+    """Rays that end on something glossy: each asks the layer that its texel belongs to, or the nearest one that has any."""
+    owner = np.full(int(covered.sum()), -1)
+    for index, layer in enumerate(layers):
+        owner[layer.texel] = index
+    owned = covered.copy()
+    owned[covered] = owner >= 0
+    whose = owner[owner >= 0][nearest_texels(place, owned)] if owned.any() else np.full(len(place), -1)
+    found = []
+    for index, layer in enumerate(layers):
+        mine, own = np.flatnonzero(whose == index), np.zeros_like(covered)
+        own[covered] = np.isin(np.arange(len(owner)), layer.texel)
+        # Look-ups count the layer's texels in their order on the lightmap, which need not be that of its places.
+        texels = look_up(place[mine], np.arange(len(mine)), np.ones(len(mine)), len(mine), own).tocoo()
+        lookup = csr_matrix((texels.data, (texels.row, np.argsort(layer.texel)[texels.col])), texels.shape)
+        towards = -rays.directions[shiny[mine]].astype(np.float64)
+        found.append(Shown(layer.name, shiny[mine], lookup, towards, layer.order, np.pi))
+    return found
 
 
 def _balls(tracer: Tracer, rays: Rays, ends: Float64[np.ndarray, " rays"], layer: Layer) -> Balls:
