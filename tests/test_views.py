@@ -1,5 +1,6 @@
 """The scene as an engine shows it: lamps and skies in closed form, layers by known functions, balls by geometry."""
 
+import io
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -7,15 +8,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
 
+import ddprt
 from ddprt import harmonics, warp
+from ddprt.config import checked
 from ddprt.dataset.layers import Layer
 from ddprt.errors import UserError
 from ddprt.lights import EnvironmentLight, MeshLight, PointLight, RectLight, SphereLight
+from ddprt.report.evaluate import evaluate
 from ddprt.report.lamps import has_size, on_picture, seen_lamps, sky_radiance
 from ddprt.report.layers import _seen
 from ddprt.report.scenery import WHITE, Scenery, close_cameras
-from ddprt.report.shots import cameras, chosen
+from ddprt.report.shots import cameras, chosen, shots
 from ddprt.report.view import Camera, Rays, default_camera, nearest_texels, seen, take_view
 from ddprt.scene.atlas import Atlas, build_atlas
 from ddprt.scene.exr import write_exr
@@ -23,6 +28,7 @@ from ddprt.scene.library import build
 from ddprt.scene.material import Gloss, Material
 from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import faceted, rectangle
+from ddprt.scene.unwrap import unwrap
 from ddprt.transport import ggx
 from ddprt.transport.embree import Tracer
 from ddprt.transport.glossiness import scattering
@@ -150,6 +156,7 @@ def test_glossy_pixels_show_their_layer_towards_the_eye(vase: tuple[Scene, Trace
     covered, camera = atlas.slot >= 0, default_camera(scene)
     texel = np.flatnonzero(atlas.albedo.max(1) == 0)
     rng = np.random.default_rng(2)
+    texel = np.append(texel, np.flatnonzero(atlas.albedo.max(1) > 0)[:50])  # texels may hold other surfaces beside gloss
     rng.shuffle(texel)  # places need not be in the order of the lightmap
     layer = Layer("gloss-2", "radiance", 2, atlas.position[texel], atlas.area[texel], texel)
     scenery = Scenery.of(tracer, scene, atlas.uv, covered, camera, [layer], height=60)
@@ -222,8 +229,8 @@ def test_a_glowing_sign_shows_its_radiance() -> None:
 
 def test_probes_are_balls_shaded_by_their_own_normals(cornell: Scene, cornell_atlas: Atlas) -> None:
     tracer, covered, camera = Tracer.of(cornell), cornell_atlas.slot >= 0, default_camera(cornell)
-    places = ((0.2, 0.4, 0.05), (0.26, 0.4, 0.05), (0.186, 0.08, 0.169))
-    layer = probes(*places, weight=[1, 1, 0])  # the third stands in the short block
+    places = ((0.2, 0.4, 0.05), (0.26, 0.4, 0.05), (0.4, 0.2, 0.05))
+    layer = probes(*places, weight=[1, 1, 0])  # the third is said to stand in a solid
     scenery = Scenery.of(tracer, cornell, cornell_atlas.uv, covered, camera, [layer], height=240)
     (balls,) = scenery.balls
     assert set(balls.probe) == {0, 1}
@@ -274,6 +281,37 @@ def test_what_is_nearer_hides_a_ball_and_a_ball_hides_what_is_farther(cornell: S
     both = Scenery.of(tracer, cornell, cornell_atlas.uv, covered, camera, [layer], height=90)
     assert not set(both.met) & set(balls.rays)
     assert set(plain.met) == set(both.met) | (set(balls.rays) & set(plain.met))
+
+
+@pytest.mark.slow
+def test_a_report_of_a_glossy_room_shows_it_from_three_places(tmp_path: Path) -> None:
+    config = checked(
+        {
+            "atlas": {"resolution": 64},
+            "lightings": {"train": 4, "validation": 1, "test": 3, "clearance": 0.1},
+            "points": {"count": 12, "supersample": 1},
+            "transport": {"samples": 4, "test_samples": 8},
+        }
+    )
+    scene = build("glossy-room")
+    data = ddprt.bake(scene, config=config, out=tmp_path / "d")
+    model = ddprt.fit(data, bases=3)
+    assert [part.layer.quantity for part in model.layers.values()] == ["radiance"]
+    evaluation = evaluate(data, {"svd-ridge": model}, {})
+    (score,) = evaluation.metrics["layers"].values()
+    assert score["seen_relative_rmse"] > 0
+    uv, _ = unwrap(scene, 64, config.atlas.padding)
+    rows = shots(evaluation, data, "svd-ridge", model, scene, Tracer.of(scene), uv)
+    assert [row["label"] for row in rows] == ["median", "worst"]
+    for row in rows:
+        assert len({view["eye"] for view in row["views"]}) == 3
+        for view in row["views"]:
+            images = [imread(io.BytesIO(view[name])) for name in ("ours", "reference", "difference")]
+            assert {image.shape for image in images} == {(320, 320, 4)}
+            assert not np.array_equal(images[0], images[1])
+            assert view["off"] > 0
+    (one,) = shots(evaluation, data, "svd-ridge", model, scene, Tracer.of(scene), uv, [(0.1, 0.3, -0.5)])[0]["views"]
+    assert one["eye"] == (0.1, 0.3, -0.5)
 
 
 # From where
