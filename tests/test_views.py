@@ -371,6 +371,9 @@ def test_errors_as_seen_are_of_what_lies_before_the_surface() -> None:
     even = np.tile(tilted(1, 1.0, np.zeros(3)), (4, 2, 1, 1)).astype(np.float32)
     assert _seen(layer, 1.1 * even, even, normal) == pytest.approx(0.1, rel=1e-5)
     assert _seen(layer, even, 0 * even, normal) is None
+    behind, twice = even.copy(), even.copy()
+    behind[:, 1], twice[:, 1] = (tilted(1, 0.0, np.array([0, -size, 0.0])) for size in (1, 2))  # dark before the second place
+    assert _seen(layer, twice, behind, normal) == 0
     one = replace(layer, weight=np.array([1.0, 0.0]))
     below = even.copy()
     below[:, 1] = 7  # counts nothing
