@@ -41,7 +41,7 @@ ROUGHNESS = (0.15, 0.25, 0.35, 0.45, 0.6, 0.8, 1.0)
 SHOWN, WIDE = (0, 2, 4, 6, 8, 12), 16
 PATHS = 1024  # of each texel, twice
 BASES = (16, 64)
-COUNTS = {"train": 144, "validation": 8, "test": 16}
+COUNTS = {"train": 96, "validation": 8, "test": 12}
 LAMPS = [
     parse_lighting(light)
     for light in (
@@ -97,9 +97,9 @@ def skies(scene: Scene, total: int) -> list[Lighting]:
 
 
 SCENES: dict[str, tuple[Callable[[], Scene], Callable[[Scene, int], list[Lighting] | None], int, int]] = {
-    "glossy-room, roughness 0.25": (lambda: build("glossy-room"), lamps, 32, 1024),
-    "glossy-room, roughness 0.5": (lambda: build("glossy-room", roughness=0.5), lamps, 32, 1024),
-    "lion, roughness 0.5, sun and sky": (lambda: coated(build("lion", cells=36), Gloss(0.5, 1.0), "fur"), skies, 32, 256),
+    "glossy-room, roughness 0.25": (lambda: build("glossy-room"), lamps, 32, 512),
+    "glossy-room, roughness 0.5": (lambda: build("glossy-room", roughness=0.5), lamps, 32, 512),
+    "lion, roughness 0.5, sun and sky": (lambda: coated(build("lion", cells=36), Gloss(0.5, 1.0), "fur"), skies, 32, 128),
 }
 """Scene, lightings (None: drawn), texels a side, paths of each."""
 

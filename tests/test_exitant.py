@@ -25,8 +25,9 @@ from ddprt.progress import Progress
 from ddprt.report.layers import layer_scores
 from ddprt.scene.atlas import Atlas, build_atlas
 from ddprt.scene.library import build
-from ddprt.scene.material import Gloss
+from ddprt.scene.material import Gloss, Material
 from ddprt.scene.mesh import Scene
+from ddprt.scene.shapes import box, faceted, hollow
 from ddprt.transport import exitant, ggx
 from ddprt.transport.effects import force
 from ddprt.transport.embree import Tracer, lifted
@@ -257,6 +258,8 @@ def test_orders_follow_the_width_of_lobes() -> None:
         order = order_for(roughness)
         x = 2 * roughness**2 * (order + 1)
         assert x * k1(x) < exitant.KEPT
+        less = 2 * roughness**2 * (order - 1)  # the next lower order would have done
+        assert order == 2 or less * k1(less) >= exitant.KEPT
 
 
 def test_each_material_pays_for_its_own_order(room: Scene) -> None:
@@ -398,12 +401,12 @@ def test_a_model_answers_for_it(data: Dataset) -> None:
 
 
 def test_paths_follow_the_noise_that_is_aimed_at(tmp_path: Path) -> None:
-    """Measured between halves of held-out light against what was expected and asked for; roughness 0.8, for few tails."""
-    shown, scene = Progress(quiet=True), vase(Gloss(0.8, 1.0))
-    data = ddprt.bake(scene, config=job(test_samples="auto", target_noise=0.1), out=tmp_path / "auto", progress=shown)
-    (stage,) = (stage for stage in shown.stages if stage["name"] == "gloss test, order 2")
-    assert 0.09 < float(stage["noise_expected"]) <= 0.1
-    layer, test = read_layer(data, "gloss-2"), data.split("test")
+    """Measured between halves of held-out light against what was expected and asked for; roughness 0.6, for few tails."""
+    shown, scene = Progress(quiet=True), vase(Gloss(0.6, 1.0))
+    data = ddprt.bake(scene, config=job(test_samples="auto", target_noise=0.2), out=tmp_path / "auto", progress=shown)
+    (stage,) = (stage for stage in shown.stages if stage["name"] == "gloss test, order 4")
+    assert 0.18 < float(stage["noise_expected"]) <= 0.2
+    layer, test = read_layer(data, "gloss-4"), data.split("test")
     light, noise = (read_light(data, layer, test, kind).astype(float) for kind in ("light", "noise"))
     share = layer.weight[:, None] / layer.weight.sum()
     mean = (light[:, :, 0] * share).sum(1).mean()
@@ -412,3 +415,24 @@ def test_paths_follow_the_noise_that_is_aimed_at(tmp_path: Path) -> None:
     # More paths are spread better than those of the pilot, so that less noise is left; texels differ in their tails.
     assert measured < 1.5 * float(stage["noise_expected"])
     assert measured > 0.2 * float(stage["noise_expected"])
+
+
+def test_no_bounces_no_light(room: Scene, tmp_path: Path) -> None:
+    shown = Progress(quiet=True)
+    data = ddprt.bake(room, config=job(bounces=0), out=tmp_path / "dark", progress=shown)
+    (layer,) = layers(data)
+    assert not read_light(data, layer, range(len(data.lightings))).any()
+    assert [stage["rays"] for stage in shown.stages if str(stage["name"]).startswith("gloss")] == [0, 0]
+
+
+def test_gloss_that_nobody_sees_costs_nothing(tmp_path: Path) -> None:
+    """A gilt box inside a box."""
+    room = hollow(np.ones((1, 1, 1), bool), *(np.array([0.0, 2.0]),) * 3)
+    boxes = [box(np.full(3, 1 - half), np.full(3, 1 + half)) for half in (0.4, 0.2)]
+    quads, paint = np.concatenate([room, *boxes]), np.repeat([0, 1], [len(room) + 6, 6])
+    materials = Material("wall", (0.5,) * 3), Material("gilt", (0.9, 0.6, 0.3), gloss=Gloss(0.3, 1.0))
+    data = ddprt.bake(faceted("hidden", quads, materials, paint), config=job(), out=tmp_path / "d")
+    assert [entry["name"] for entry in data.description["layers"]] == ["gloss-8"]
+    assert len(read_layer(data, "gloss-8").position) == 0
+    assert layers(data) == []
+    assert not ddprt.fit(data, "mean").layers

@@ -19,7 +19,6 @@ from ddprt.dataset.layers import Layer, read_layer, write_halves, write_places
 from ddprt.dataset.manifest import Manifest, layer_lacks, layer_name
 from ddprt.dataset.scratch import Scratch
 from ddprt.dataset.store import Dataset
-from ddprt.errors import UserError
 from ddprt.progress import Progress, Stage
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
@@ -76,24 +75,18 @@ class GlossBake:
     ) -> "tuple[GlossBake, ...]":
         """Finds the glossy texels and writes where they are, unless that is there; empty where nothing glosses.
 
-        Raises:
-          UserError: glossy materials of an order are nowhere in the open.
+        An order whose materials are nowhere in the open has a layer without places, which nothing learns.
         """
-        module, found = _simulation(scene), list[GlossBake]()
+        module = _simulation(scene)
+        if module is None:
+            return ()
+        found = list[GlossBake]()
         for entry in gloss_layers(scene):
-            exits = module.Exits.of(scene, atlas, entry["order"])  # type: ignore[union-attr]
-            if not exits.count:
-                users = module.orders(scene)[entry["order"]]  # type: ignore[union-attr]
-                named = ", ".join(f'"{scene.materials[index].name}"' for index in users)
-                raise UserError(
-                    f"material {named}: got gloss on surfaces that cover no texel in the open, expected some; move them there, "
-                    "or make the material diffuse"
-                )
+            exits = module.Exits.of(scene, atlas, entry["order"])
             if not manifest.holds(layer_name(entry["name"], "places")):
                 layer = Layer(**entry, position=atlas.position[exits.texel], weight=exits.weight, texel=exits.texel)
                 write_places(dataset.folder, layer, manifest)
             layer = read_layer(dataset, entry["name"])
-            assert module is not None
             found.append(cls(module, exits, layer, config, scene, tracer, dataset, manifest, bounces))
         return tuple(found)
 
@@ -106,7 +99,7 @@ class GlossBake:
         with progress.stage(f"gloss {split}, order {self.layer.order}") as stage:
             before, count, parts = self.tracer.rays, self.exits.count, []
             stage.facts |= {"texels": count}
-            if self.bounces == 0:
+            if self.bounces == 0 or count == 0:
                 dark = np.zeros((count, self.layer.coefficients, 3), np.float32)
                 write_halves(self.dataset.folder, self.layer.name, todo, lambda index: [dark] * len(kinds), self.manifest)
             else:

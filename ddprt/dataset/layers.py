@@ -112,8 +112,9 @@ def read_layer(data: Dataset, name: str) -> Layer:
 
 
 def layers(data: Dataset) -> list[Layer]:
-    """All that a dataset has."""
-    return [read_layer(data, entry["name"]) for entry in data.description.get("layers", [])]
+    """All that a dataset has, but those without places: of gloss that nobody sees."""
+    found = [read_layer(data, entry["name"]) for entry in data.description.get("layers", [])]
+    return [layer for layer in found if len(layer.position)]
 
 
 def read_light(

@@ -97,7 +97,9 @@ class Exits:
         texel, group = np.unique(atlas.piece_texel[pieces], return_inverse=True)
         area = atlas.piece_area[pieces]
         place = group, area, atlas.piece_corners[pieces], atlas.piece_triangle[pieces]
-        return cls(order, texel, np.bincount(group, area), SurfaceSampler.build(*place) if len(pieces) else None)
+        return cls(
+            order, texel, np.bincount(group, area).astype(np.float64), SurfaceSampler.build(*place) if len(pieces) else None
+        )
 
     @property
     def count(self) -> int:
