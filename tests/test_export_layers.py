@@ -109,7 +109,7 @@ def test_what_earlier_exports_left_goes_and_nothing_else(data: Dataset, tmp_path
     model = ddprt.fit(data, bases=3)
     export_layers(model, tmp_path)
     for name in ("notes.json", "notes.safetensors", "points.json", "transfer.safetensors"):
-        (tmp_path / name).write_text('{"file": "other.safetensors"}')
+        (tmp_path / name).write_text('{"ddprt": "1", "file": "other.safetensors"}')
     for suffix in (".json", ".safetensors"):
         shutil.copy(tmp_path / f"gloss-4{suffix}", tmp_path / f"gloss-2{suffix}")
     told = json.loads((tmp_path / "gloss-2.json").read_text())
