@@ -338,12 +338,16 @@ def test_given_places_look_at_the_middle(cornell: Scene) -> None:
     tracer = Tracer.of(cornell)
     first = default_camera(cornell)
     assert cameras(cornell, tracer, (), []) == [first]
-    side, above = cameras(cornell, tracer, ((0.1, 0.3, -0.5), (first.target[0], 3.0, first.target[2])), [])
+    x, y, z = cornell.centre.tolist()
+    side, above = cameras(cornell, tracer, ((0.1, 0.3, -0.5), (x, 3.0, z)), [])
     assert side.eye == (0.1, 0.3, -0.5)
-    assert side.target == above.target == first.target
+    assert side.target == above.target == (x, y, z)
     assert np.isfinite(above.axes).all()  # straight down
     with pytest.raises(UserError, match=r"report\.views: got"):
-        cameras(cornell, tracer, (first.target,), [])
+        cameras(cornell, tracer, ((x, y, z),), [])
+    gloss = Layer("gloss-2", "radiance", 2, np.array([[0.1, 0.2, 0.3], [0.3, 0.4, 0.3]]), np.ones(2), np.arange(2))
+    (one,) = cameras(cornell, tracer, ((0.1, 0.3, -0.5),), [probes((0.5, 0.5, 0.5)), gloss])
+    np.testing.assert_allclose(one.target, [0.2, 0.3, 0.3])
 
 
 def test_the_median_and_the_worst_are_shown() -> None:

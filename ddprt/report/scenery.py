@@ -220,16 +220,21 @@ class Scenery:
         return mirrored(self.tracer, lighting, self.tracer.on_triangle(*where), self.tracer.normals[where[0]], lobes)
 
 
+def middle_of_gloss(layers: Sequence[Layer]) -> Float64[np.ndarray, "3"] | None:
+    """Of the box about all that is glossy, metres; None where nothing is."""
+    place = np.concatenate([np.zeros((0, 3)), *(layer.position for layer in layers if layer.quantity == "radiance")])
+    return (place.min(0) + place.max(0)) / 2 if len(place) else None
+
+
 def close_cameras(tracer: Tracer, camera: Camera, layers: Sequence[Layer]) -> list[Camera]:
     """Two cameras near to what is glossy, right and left of the way from which another looks at it; none where nothing is.
 
     Of some on each side, the one that sees the most of it.
     """
-    places = [layer.position for layer in layers if layer.quantity == "radiance" and len(layer.position)]
-    if not places:
+    target = middle_of_gloss(layers)
+    if target is None:
         return []
-    place = np.concatenate(places)
-    target = (place.min(0) + place.max(0)) / 2
+    place = np.concatenate([layer.position for layer in layers if layer.quantity == "radiance"])
     back = np.asarray(camera.eye) - target
     reach = float(np.linalg.norm(place - target, axis=1).max()) / (_CLOSE * float(camera.reach.min()))
     back *= min(1.0, reach / float(np.linalg.norm(back)))

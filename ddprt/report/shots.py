@@ -12,8 +12,8 @@ from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.report.evaluate import Evaluation
 from ddprt.report.lamps import has_size, on_picture
-from ddprt.report.scenery import Scenery, close_cameras
-from ddprt.report.view import Camera, default_camera, diverging, exposure_for, png, signed_range, tonemap
+from ddprt.report.scenery import Scenery, close_cameras, middle_of_gloss
+from ddprt.report.view import Camera, default_camera, diverging, exposure_for, png, signed_range, tonemap, triple
 from ddprt.runtime.model import Model
 from ddprt.scene.mesh import Scene
 from ddprt.transport.embree import Tracer
@@ -22,7 +22,7 @@ Eye = tuple[float, float, float]
 
 
 def cameras(scene: Scene, tracer: Tracer, eyes: Sequence[Eye], layers: Sequence[Layer]) -> list[Camera]:
-    """From where the scene is shown: from given places (metres) towards the middle of its default picture.
+    """From where the scene is shown: from given places (metres) towards the middle of what is glossy, or of the scene.
 
     Where none is given, as in the default picture, and from two places near to what is glossy.
 
@@ -32,13 +32,14 @@ def cameras(scene: Scene, tracer: Tracer, eyes: Sequence[Eye], layers: Sequence[
     first = default_camera(scene)
     if not eyes:
         return [first, *close_cameras(tracer, first, layers)]
-    found = []
+    found, target = [], middle_of_gloss(layers)
+    target = scene.centre if target is None else target
     for eye in eyes:
-        away = np.subtract(first.target, eye)
+        away = target - eye
         if np.linalg.norm(away) < 1e-3 * scene.radius:
             raise UserError(f"report.views: got {list(eye)}, which is what all of them look at; expected places at a distance")
         upright = np.linalg.norm(np.cross(away, first.up)) > 1e-3 * np.linalg.norm(away)
-        found.append(replace(first, eye=eye, up=first.up if upright else (0.0, 0.0, -1.0)))
+        found.append(replace(first, eye=eye, target=triple(target), up=first.up if upright else (0.0, 0.0, -1.0)))
     return found
 
 
