@@ -26,14 +26,16 @@ _TO_HARMONICS = [
     "y[place, k, colour] = mean + sum over bases of u[b] * basis[b, place, k]; in gamma space y = sign(y) |y|^gamma",
 ]
 _PROBES = [
-    "c = s * y; where source[probe] differs from probe, it stands in a solid: take c of the probe named there",
+    "c = s * y, plus constant where there is such a tensor: light of surfaces that glow",
+    "where source[probe] differs from probe, it stands in a solid: take c of the probe named there",
     "between probes of a grid: c trilinear; x is the slowest axis, z the fastest",
     "irradiance on a plane with unit normal n: max(0, sum over k of c[k] Y_k(n)), in W/m²; radiance = albedo / pi * irradiance",
     "Y = 0.282095, 0.488603 (y, z, x), 1.092548 (x y, y z), 0.315392 (3 z² - 1), 1.092548 x z, 0.546274 (x² - y²) of n",
     "the engine adds direct light, of lamps and skies, by itself",
 ]
 _SURFACE = [
-    "c = s * y; between texels of the layer: c bilinear, by their row and column on the lightmap",
+    "c = s * y, plus constant where there is such a tensor: light of surfaces that glow",
+    "between texels of the layer: c bilinear, by their row and column on the lightmap",
     "radiance towards the eye, w the unit vector from the surface to it: max(0, sum over k of c[k] Y_k(w)), in W/(m² sr)",
     "Y: real harmonics of world axes, orthonormal, k = l² + l + m: for m = 0 sqrt(K) P, for m > 0 sqrt(2K) P cos(m t), for "
     "m < 0 sqrt(2K) P sin(|m| t), where t = atan2(y, x), K = (2l + 1) (l - |m|)! / (4 pi (l + |m|)!), P = (-1)^m P_l^|m|(z)",
@@ -92,6 +94,8 @@ def _export(part: LayerModel, covered: Bool[np.ndarray, "height width"], folder:
         "offset": np.asarray(relighter.offset),
         "intercept": np.asarray(relighter.intercept),
     }
+    if model.constant is not None:
+        tensors["constant"] = model.constant.reshape(*shape[:2], 3)
     floats = {key: value.astype(np.float32) for key, value in tensors.items()}
     whose = nearest_valid(layer) if free else np.argwhere(covered)[layer.texel]
     files = folder / f"{name}.safetensors", folder / f"{name}.json"

@@ -45,11 +45,11 @@ def _scores(data: Dataset, part: LayerModel) -> dict[str, Any]:
     lightings = [data.lightings[index] for index in test]
     found: dict[str, Any] = {
         "places": int((layer.weight > 0).sum()),
-        "relative_rmse": share(model.predict(values, lightings=lightings, clamp=False) - reference),
+        "relative_rmse": share(model.predict(values, lightings=lightings, clamp=False, constant=False) - reference),
         "noise_relative_rmse": share(own.maps("noise", test)),
     }
     if layer.quantity == "radiance" and (layer.texel >= 0).all():
-        light = part.predict(values, lightings=lightings)
+        light = part.predict(values, lightings=lightings, constant=False)
         found["seen_relative_rmse"] = _seen(
             layer, light, reference.reshape(light.shape), data.gbuffer["geometric_normal"][layer.texel]
         )
@@ -62,7 +62,7 @@ def _scores(data: Dataset, part: LayerModel) -> dict[str, Any]:
     found["curve"] = []
     for bases in sorted({*(2**power for power in range(len(basis).bit_length())), len(basis)}):
         shorter = replace(model, relighter=model.relighter.truncated(bases))  # type: ignore[attr-defined]
-        error = share(shorter.predict(values, clamp=False) - reference)
+        error = share(shorter.predict(values, clamp=False, constant=False) - reference)
         found["curve"].append({"bases": bases, "relative_rmse": error})
     return found
 

@@ -83,6 +83,9 @@ def shots(
         direct, values = data.maps("direct", [index])[0], data.values([index], model.points, model.quantity)[0]
         ours = {name: part.predict(values, lightings=lighting) for name, part in model.layers.items()}
         reference = {layer.name: read_light(data, layer, [index])[0] for layer in layers}
+        for name, part in model.layers.items():
+            if part.model.constant is not None:
+                reference[name] = reference[name] + part.model.constant.reshape(reference[name].shape)
         lamps = [light.anchor() for light in lighting if not has_size(light)]
         shown = []
         for view in views:
