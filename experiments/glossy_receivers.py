@@ -99,7 +99,8 @@ def skies(scene: Scene, total: int) -> list[Lighting]:
 SCENES: dict[str, tuple[Callable[[], Scene], Callable[[Scene, int], list[Lighting] | None], int, int]] = {
     "glossy-room, roughness 0.25": (lambda: build("glossy-room"), lamps, 32, 512),
     "glossy-room, roughness 0.5": (lambda: build("glossy-room", roughness=0.5), lamps, 32, 512),
-    "lion, roughness 0.5, sun and sky": (lambda: coated(build("lion", cells=36), Gloss(0.5, 1.0), "fur"), skies, 32, 128),
+    "lion, metal, sun and sky": (lambda: coated(build("lion", cells=36), Gloss(0.5, 1.0), "fur"), skies, 48, 128),
+    "lion, glazed, sun and sky": (lambda: coated(build("lion", cells=36), Gloss(0.5, 0.0), "fur"), skies, 48, 128),
 }
 """Scene, lightings (None: drawn), texels a side, paths of each."""
 
