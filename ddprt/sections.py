@@ -221,6 +221,9 @@ class ReportConfig(Section):
     """What the report shows."""
 
     rows: int = Field(4, ge=1, le=64, description="held-out lightings shown as pictures")
+    views: tuple[tuple[float, float, float], ...] = Field(
+        (), description="places (metres) to see what is glossy, or the whole, from; none: as usual, and two near to gloss"
+    )
     bases_curve: tuple[Annotated[int, Field(ge=1)], ...] = Field(
         (4, 8, 16, 32, 64), min_length=1, description="numbers of bases on the error curve"
     )

@@ -14,7 +14,7 @@ import numpy as np
 
 from ddprt.axes import Float32
 from ddprt.config import Config
-from ddprt.dataset.layers import Layer, read_layer, write_halves, write_places
+from ddprt.dataset.layers import Layer, read_layer, write_halves, write_light, write_places
 from ddprt.dataset.manifest import Manifest, layer_lacks, layer_name
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError

@@ -85,7 +85,7 @@ def shared(
       The sum over a group of factor times `evaluate`, over the sum of `pdf`; 0 for directions below the surface.
     """
     worth = np.empty((len(incoming), factor.shape[1], 3), np.float32)
-    _shared(incoming, base, gloss, group, outgoing, factor, *_tables(), worth)
+    _shared(incoming, base, gloss, group, outgoing, factor, *tables(), worth)
     return worth
 
 
