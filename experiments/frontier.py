@@ -375,7 +375,8 @@ def best_within(trial: Trial, limits: dict[str, float], offered: Sequence[int], 
     """The plan of a place that errs least among those that cost no more than the limits, where it may keep within an error.
 
     Returns:
-      How unlikely that is and the plan; None where nothing at the place costs so little, or where its chance to err by no more is under one in a thousand.
+      How unlikely that is, and the plan; None where nothing at the place costs so little, or where its chance to err by no
+      more is under one in a thousand.
     """
     if trial.bake_seconds > limits["bake_seconds"]:
         return None
