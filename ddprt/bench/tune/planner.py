@@ -161,6 +161,7 @@ class Planner:
     def add(self, trial: Trial) -> None:
         """Learns from a trial."""
         self.trials.append(trial)
+        self.barred.discard(trial.place)  # whatever others let expect
         self._learn()
 
     def replace(self, trial: Trial) -> None:
@@ -178,12 +179,12 @@ class Planner:
         Returns:
           How many places are left out now that were not before.
         """
-        before, at = len(self.barred), KNOBS.index("points.count")
+        before, at, tried = len(self.barred), KNOBS.index("points.count"), {trial.place for trial in self.trials}
         self.barred |= {
             other
             for other in product(*self.values)
             if other == place or (other[0] == place[0] and (knob == KNOBS[0] or (knob == KNOBS[at] and other[at] >= place[at])))
-        }
+        } - tried
         return len(self.barred) - before
 
     def _learn(self) -> None:
@@ -208,14 +209,18 @@ class Planner:
         return _rank(self.guesses(plan), self.limits)
 
     def undecided(self, plan: Plan) -> bool:
-        """Whether more held-out lightings may tell if a plan meets the budget, which else it seems to meet."""
+        """Whether more held-out lightings may tell if a plan meets the budget, which else it seems to meet.
+
+        While there may be more, it is decided when a chance of one in fifty is left that it is otherwise: looking again and
+        again would let chance in often enough if nine in ten were taken for sure each time.
+        """
         guesses = self.guesses(plan)
         error, limit = guesses["relative_rmse"], self.limits.get("relative_rmse")
         if limit is None or error.spread <= _AGAIN:
             return False
         others = [name for name in self.limits if name != "relative_rmse"]
         within = all(guesses[name].mean <= log(self.limits[name]) for name in others)
-        return within and log(_HOPELESS) < error.chance(limit) < log(_SURE)
+        return within and log(_HOPELESS) < error.chance(limit) < log(1 - _HOPELESS)
 
     def hopeless(self, chance: float) -> bool:
         """Whether a chance is too small to go on."""
