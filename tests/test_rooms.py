@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parent.parent / "ddprt"
-GROUND = {"errors", "axes", "catalogue", "compiled", "seeds", "warp", "files", "progress", "machine"}
+GROUND = {"errors", "axes", "catalogue", "compiled", "seeds", "warp", "harmonics", "files", "progress", "machine"}
 WALK = [
     "sections",
     "config",
@@ -51,7 +51,13 @@ def imports(path: Path) -> list[str]:
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
             found.append(node.module or "")
+            if node.module == "ddprt":
+                found += [f"ddprt.{alias.name}" for alias in node.names if is_room(alias.name)]
     return found
+
+
+def is_room(name: str) -> bool:
+    return (PACKAGE / name).is_dir() or (PACKAGE / f"{name}.py").exists()
 
 
 def room(path: Path) -> str:

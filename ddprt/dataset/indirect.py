@@ -90,7 +90,8 @@ class IndirectBake:
     def constant(self) -> None:
         """Bakes the light of what glows, if a plan calls for it."""
         emission = self.effects.module("emission")
-        if emission is None or self.manifest.holds(CONSTANT):
+        probes = self._probes if self._probes and self._probes.lacks_constant() else None
+        if emission is None or (self.manifest.holds(CONSTANT) and probes is None):
             return
         config, before = self.config.transport, self.tracer.rays
         with self.progress.stage("emission") as stage:
@@ -103,7 +104,8 @@ class IndirectBake:
                 )
             write_map(self.dataset.folder / CONSTANT, self.atlas.image(found.irradiance))
             self.manifest.add(CONSTANT)
-            stage.facts |= found.facts | {"rays": self.tracer.rays - before}
+            more = probes.constant(found.direct, self.atlas, self.scene, self.effects.bounces) if probes else {}
+            stage.facts |= found.facts | more | {"rays": self.tracer.rays - before}
 
     @cached_property
     def _operator(self) -> Any:

@@ -65,8 +65,8 @@ def write_places(folder: Path, layer: Layer, manifest: Manifest) -> None:
     manifest.add(name)
 
 
-def write_light(folder: Path, layer: str, index: int, light: np.ndarray, manifest: Manifest, kind: str = "light") -> None:
-    """Coefficients of one lighting, (places, coefficients, 3) float32.
+def write_light(folder: Path, layer: str, index: int | str, light: np.ndarray, manifest: Manifest, kind: str = "light") -> None:
+    """Coefficients of one lighting, or of what no lighting changes ("constant"), (places, coefficients, 3) float32.
 
     Raises:
       UserError: not finite.
@@ -98,9 +98,9 @@ def layers(data: Dataset) -> list[Layer]:
 
 
 def read_light(
-    data: Dataset, layer: Layer, indices: Sequence[int], kind: str = "light"
+    data: Dataset, layer: Layer, indices: Sequence[int | str], kind: str = "light"
 ) -> Float32[np.ndarray, "lightings places coefficients 3"]:
-    """Coefficients of lightings; kind is "light" or, of held-out lightings, "noise" (half the difference of two halves).
+    """Coefficients of lightings or of "constant"; kind is "light" or, of held-out ones, "noise" (half of what halves differ).
 
     Raises:
       UserError: a file that is not of this layer or holds what is not finite.
@@ -155,6 +155,12 @@ class LayerData(Dataset):
     def uv(self) -> None:
         """None."""
         return None
+
+    @cached_property
+    def constant(self) -> Float32[np.ndarray, "texels 3"] | None:
+        """Coefficients of emissive surfaces, in no other file of the layer; None where none were baked."""
+        entry = next(entry for entry in self.description["layers"] if entry["name"] == self._layer.name)
+        return read_light(self, self._layer, ["constant"])[0].reshape(-1, 3) if entry.get("constant") else None
 
     def maps(self, kind: str, indices: Sequence[int]) -> Float32[np.ndarray, "lightings texels 3"]:
         """Coefficients in place of texels; kind is "indirect" or "noise"."""

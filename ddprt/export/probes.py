@@ -24,7 +24,8 @@ DECODE = [
     "x, s and z: as for the lightmap, see manifest.json",
     "u = matrix (z - offset) + intercept",
     "y[probe, k, colour] = mean + sum over bases of u[b] * basis[b, probe, k]; in gamma space y = sign(y) |y|^gamma",
-    "c = s * y; where source[probe] differs from probe, it stands in a solid: take c of the probe named there",
+    "c = s * y, plus constant where there is such a tensor: light of surfaces that glow",
+    "where source[probe] differs from probe, it stands in a solid: take c of the probe named there",
     "between probes of a grid: c trilinear; x is the slowest axis, z the fastest",
     "irradiance on a plane with unit normal n: max(0, sum over k of c[k] Y_k(n)), in W/m²; radiance = albedo / pi * irradiance",
     "Y = 0.282095, 0.488603 (y, z, x), 1.092548 (x y, y z), 0.315392 (3 z² - 1), 1.092548 x z, 0.546274 (x² - y²) of n",
@@ -62,6 +63,8 @@ def export_probes(model: Model, folder: str | Path, name: str = "probes") -> lis
         "offset": np.asarray(relighter.offset),
         "intercept": np.asarray(relighter.intercept),
     }
+    if part.model.constant is not None:
+        tensors["constant"] = part.model.constant.reshape(*shape[:2], 3)
     floats = {key: value.astype(np.float32) for key, value in tensors.items()}
     write_tensors(folder / FILES[0], {**floats, "source": nearest_valid(layer).astype(np.int32)})
     document = {

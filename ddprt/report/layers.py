@@ -41,7 +41,7 @@ def _scores(data: Dataset, part: LayerModel) -> dict[str, Any]:
     lightings = [data.lightings[index] for index in test]
     found: dict[str, Any] = {
         "places": int((layer.weight > 0).sum()),
-        "relative_rmse": share(model.predict(values, lightings=lightings, clamp=False) - reference),
+        "relative_rmse": share(model.predict(values, lightings=lightings, clamp=False, constant=False) - reference),
         "noise_relative_rmse": share(own.maps("noise", test)),
     }
     basis = getattr(model.relighter, "basis", None)
@@ -53,6 +53,6 @@ def _scores(data: Dataset, part: LayerModel) -> dict[str, Any]:
     found["curve"] = []
     for bases in sorted({*(2**power for power in range(len(basis).bit_length())), len(basis)}):
         shorter = replace(model, relighter=model.relighter.truncated(bases))  # type: ignore[attr-defined]
-        error = share(shorter.predict(values, clamp=False) - reference)
+        error = share(shorter.predict(values, clamp=False, constant=False) - reference)
         found["curve"].append({"bases": bases, "relative_rmse": error})
     return found

@@ -6,14 +6,15 @@ that the path came from, and each light is weighed by that; paths go on where th
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from ddprt import warp
-from ddprt.axes import Bool, Float32, Int32
+from ddprt.axes import Bool, Float32, Int, Int32
 from ddprt.scene.material import Material, bilinear
 from ddprt.scene.mesh import Scene
-from ddprt.transport import ggx
+from ddprt.transport import ggx, weighing
 from ddprt.transport.embree import Tracer, lifted
 from ddprt.transport.glossiness import glossy
 from ddprt.transport.walk import MAX_SURVIVAL, SURVIVAL, Vertices
@@ -44,7 +45,11 @@ class Lobes:
         incoming, weight = ggx.sample(self.outgoing, u, self.base, self.gloss)
         return warp.to_world(incoming, self.frames), weight
 
-    def part(self, which: slice) -> "Lobes":
+    def density(self, directions: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, " n"]:
+        """Of what `scattered` gives, per steradian, at world directions."""
+        return ggx.pdf(self.outgoing, _to_local(directions, self.frames), self.base, self.gloss)
+
+    def part(self, which: slice | Int[np.ndarray, " some"]) -> "Lobes":
         """Some of them."""
         return Lobes(self.frames[which], self.outgoing[which], self.base[which], self.gloss[which])
 
@@ -89,9 +94,12 @@ class GlossyVertices:
 
     def lit_from(self, directions: Float32[np.ndarray, "n 3"]) -> Vertices:
         """What each W/m² that arrives from directions is worth to the receivers."""
-        cosine = np.einsum("dn,nd->n", self.place[3:], directions)
-        factor = np.divide(np.float32(np.pi), cosine, out=np.zeros_like(cosine), where=cosine > 0)
-        return replace(self.there, throughput=self.there.throughput * (self.lobes.reflected(directions).T * factor))
+        lobes, there = self.lobes, self.there
+        return replace(there, throughput=weighing.weigh(self._held, lobes.frames, lobes.outgoing, directions, there.throughput))
+
+    @cached_property
+    def _held(self) -> Float32[np.ndarray, "n 11"]:
+        return weighing.prepared(self.lobes.outgoing, self.lobes.base, self.lobes.gloss)
 
     def go_on(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Origins and directions of the paths that survive roulette, their throughput and receivers."""
