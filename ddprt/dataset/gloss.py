@@ -5,7 +5,7 @@ lightings are the mean of two independent halves, with half their difference as 
 simulation is imported where nothing glosses.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from types import ModuleType
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from ddprt import harmonics
+from ddprt.axes import Float32
 from ddprt.config import Config
 from ddprt.dataset.layers import Layer, read_layer, write_halves, write_places
 from ddprt.dataset.manifest import Manifest, layer_lacks, layer_name
@@ -24,6 +25,9 @@ from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
 from ddprt.transport.embree import Tracer
 from ddprt.transport.glossiness import glossy
+
+Shown = Float32[np.ndarray, "texels 3 lightings"]
+"""Direct and indirect light of texels, W/m²."""
 
 
 def _simulation(scene: Scene) -> ModuleType | None:
@@ -48,7 +52,7 @@ class GlossBake:
       module: of the simulation.
       exits: the places, as it knows them.
       layer: the same, as the dataset keeps them.
-      config, scene, tracer, dataset, manifest, bounces: of the bake.
+      config, scene, tracer, atlas, dataset, manifest, bounces: of the bake.
     """
 
     module: ModuleType
@@ -57,6 +61,7 @@ class GlossBake:
     config: Config
     scene: Scene
     tracer: Tracer
+    atlas: Atlas
     dataset: Dataset
     manifest: Manifest
     bounces: int
@@ -87,11 +92,17 @@ class GlossBake:
                 layer = Layer(**entry, position=atlas.position[exits.texel], weight=exits.weight, texel=exits.texel)
                 write_places(dataset.folder, layer, manifest)
             layer = read_layer(dataset, entry["name"])
-            found.append(cls(module, exits, layer, config, scene, tracer, dataset, manifest, bounces))
+            found.append(cls(module, exits, layer, config, scene, tracer, atlas, dataset, manifest, bounces))
         return tuple(found)
 
-    def run(self, split: str, indices: Sequence[int], progress: Progress) -> None:
-        """Bakes the layer of a split's lightings where some are missing: "train" (with validation) or "test"."""
+    def run(self, split: str, indices: Sequence[int], shown: Callable[[int], Shown], progress: Progress) -> None:
+        """Bakes the layer of a split's lightings where some are missing.
+
+        Args:
+          split, indices: "train" (with validation) or "test", and its lightings.
+          shown: the light on the atlas that each half is made from.
+          progress: told of the stage.
+        """
         kinds = ("light", "noise")[: 1 + (split == "test")]
         todo = layer_lacks(self.manifest, self.layer.name, kinds, indices)
         if not todo:
@@ -103,11 +114,12 @@ class GlossBake:
                 dark = np.zeros((count, self.layer.coefficients, 3), np.float32)
                 write_halves(self.dataset.folder, self.layer.name, todo, lambda index: [dark] * len(kinds), self.manifest)
             else:
-                lightings = [self.dataset.lightings[index] for index in indices]
-                lit = self.module.Lit.of(self.tracer, self.scene, lightings, self.bounces)
-                samples = self._samples(lit, split, len(kinds), stage, progress)
-                stage.pace(len(kinds) * samples * count)
+                lightings, samples = [self.dataset.lightings[index] for index in indices], 0
                 for half in range(len(kinds)):
+                    lit = self.module.Lit.of(self.tracer, self.scene, self.atlas, lightings, shown(half))
+                    if half == 0:
+                        samples = self._samples(lit, split, len(kinds), stage, progress)
+                        stage.pace(len(kinds) * samples * count)
                     parts.append(self._traced(lit, f"{split}-{half}", len(indices), samples, stage))
                 shape = count, harmonics.count(self.layer.order), 3
 
