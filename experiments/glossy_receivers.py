@@ -38,6 +38,7 @@ from ddprt.transport.direct import Texels
 from ddprt.transport.effects import force
 from ddprt.transport.embree import Tracer
 from ddprt.transport.paths import trace_paths
+from ddprt.transport.reflected import Lit
 
 ROUGHNESS = (0.15, 0.25, 0.35, 0.45, 0.6, 0.8, 1.0)
 SHOWN, WIDE = (0, 2, 4, 6, 8, 12), 16
@@ -67,7 +68,7 @@ def projection(roughness: float) -> list[float]:
     texels, light = Texels.of(tracer, fine, 4, np.random.default_rng(0)), np.zeros((len(LAMPS), fine.count, 3), np.float32)
     list(trace_paths(tracer, scene, fine, LAMPS, light, samples=64, seed=0, stream="shown"))
     light += np.stack([texels.irradiance(lamp, np.random.default_rng(1)) for lamp in LAMPS])
-    lit = exitant.Lit.of(tracer, scene, fine, LAMPS, np.ascontiguousarray(light.transpose(1, 2, 0)))
+    lit = Lit.of(tracer, scene, fine, LAMPS, np.ascontiguousarray(light.transpose(1, 2, 0)))
     exits = exitant.Exits.of(scene, atlas, exitant.order_for(roughness))
     wide, runs = replace(exits, order=WIDE), []
     for run in range(2):

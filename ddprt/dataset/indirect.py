@@ -99,7 +99,8 @@ class IndirectBake:
         """Bakes the light of what glows, if a plan calls for it."""
         emission = self.effects.module("emission")
         probes = self._probes if self._probes and self._probes.lacks_constant() else None
-        if emission is None or (self.manifest.holds(CONSTANT) and probes is None):
+        glossy = [layer for layer in self._glossy if layer.lacks_constant()] if emission else []
+        if emission is None or (self.manifest.holds(CONSTANT) and probes is None and not glossy):
             return
         config, before = self.config.transport, self.tracer.rays
         with self.progress.stage("emission") as stage:
@@ -113,6 +114,8 @@ class IndirectBake:
             write_map(self.dataset.folder / CONSTANT, self.atlas.image(found.irradiance))
             self.manifest.add(CONSTANT)
             more = probes.constant(found.direct, self.atlas, self.scene, self.effects.bounces) if probes else {}
+            for layer in glossy:
+                layer.constant(found.irradiance)
             stage.facts |= found.facts | more | {"rays": self.tracer.rays - before}
 
     @cached_property

@@ -5,10 +5,8 @@ It lives on a hemisphere. Mirrored at the surface's plane it becomes a function 
 harmonics ring little; in the surface's own frame those with odd l + m vanish. Coefficients are c_k = integral over the
 hemisphere of (Y_k(o) + Y_k(mirrored o)) L(o): linear in light, so that basis and transfer hold for them as for texels.
 
-What a surface shows is what is there to be seen: a ray that lands on a diffuse surface takes the light that the lightmaps have
-there, direct and indirect, and ends. So all lightings share rays, no lamp is asked but on glossy surfaces that are seen in
-glossy ones, and the noise is that of maps, which are means over texels and over many paths. What is blurred by the width of a
-texel would be blurred by the harmonics all the more.
+What a surface shows is what is there to be seen: see `ddprt.transport.reflected`. What is blurred there by the width of a texel
+would be blurred by the harmonics all the more.
 
 Each ray is drawn for a direction o of its own, spread evenly over the hemisphere, and by the lobe about it; what it finds then
 counts for all directions of its group. With rays i_p that are drawn for o_p, the sum over p of
@@ -21,9 +19,9 @@ The rougher a surface, the more directions what a ray found is good for.
 How many harmonics a lobe needs follows from its width: see `order_for`.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.special import k1
@@ -31,18 +29,14 @@ from scipy.special import k1
 from ddprt import harmonics, seeds, warp
 from ddprt.axes import Float32, Float64, Int, Int32
 from ddprt.compiled import compiled
-from ddprt.lights import Lighting
 from ddprt.scene.atlas import Atlas, SurfaceSampler, weights_at
 from ddprt.scene.material import Gloss
 from ddprt.scene.mesh import Scene
 from ddprt.transport import ggx
-from ddprt.transport.direct import centred
-from ddprt.transport.embree import Tracer, lifted
-from ddprt.transport.gather import Landing, landed_on
+from ddprt.transport.embree import lifted
 from ddprt.transport.gloss import Surfaces
 from ddprt.transport.glossiness import glossy, least_roughness
-from ddprt.transport.shading import Lamp, shade, shift
-from ddprt.transport.walk import Albedo, albedo_of
+from ddprt.transport.reflected import Lit
 
 ORDERS = (2, 4, 6, 8)
 """Orders that layers have: few, so that surfaces of about equal roughness share one."""
@@ -53,8 +47,8 @@ KEPT = 0.2
 _GROUP = 32  # rays that count for each other's directions
 _CALL = 1 << 12  # rays that are traced together
 _PLACES = 16  # that are traced together: sums of all lightings take much room
-_PROBED, _PILOT = 128, 64  # texels, and paths of each in two independent runs, that predict how many are needed
-_LEAST, _MOST = 8, 8192  # paths per texel that "auto" may choose
+_PROBED, _PILOT = 128, 64  # texels, and rays of each in two independent runs, that predict how many are needed
+_LEAST, _MOST = 8, 8192  # rays per texel that "auto" may choose
 
 
 def order_for(roughness: float) -> int:
@@ -116,27 +110,27 @@ class Exits:
 
 @dataclass(frozen=True, eq=False)
 class Departures:
-    """Paths that leave glossy surfaces, and what each is drawn for.
+    """Rays that leave glossy surfaces, and what each is drawn for.
 
     Attributes:
-      origins: of rays, centred frame, metres.
+      origins: centred frame, metres.
       triangle: that each starts on.
-      outgoing, incoming: unit directions in the triangle's frame: where light is asked for, and where the path looks for it.
+      outgoing, incoming: unit directions in the triangle's frame: where light is asked for, and where the ray looks for it.
       base, gloss: of the surface there; see `ggx.evaluate`.
     """
 
-    origins: Float32[np.ndarray, "paths 3"]
-    triangle: Int32[np.ndarray, " paths"]
-    outgoing: Float32[np.ndarray, "paths 3"]
-    incoming: Float32[np.ndarray, "paths 3"]
-    base: Float32[np.ndarray, "paths 3"]
-    gloss: Float32[np.ndarray, "paths 3"]
+    origins: Float32[np.ndarray, "rays 3"]
+    triangle: Int32[np.ndarray, " rays"]
+    outgoing: Float32[np.ndarray, "rays 3"]
+    incoming: Float32[np.ndarray, "rays 3"]
+    base: Float32[np.ndarray, "rays 3"]
+    gloss: Float32[np.ndarray, "rays 3"]
 
     @classmethod
     def of(
-        cls, surfaces: Surfaces, sampler: SurfaceSampler, group: Int[np.ndarray, " paths"], u: Float32[np.ndarray, "paths 7"]
+        cls, surfaces: Surfaces, sampler: SurfaceSampler, group: Int[np.ndarray, " rays"], u: Float32[np.ndarray, "rays 7"]
     ) -> "Departures":
-        """One path of each group: two numbers for its place, two for where light goes, three for where it comes from."""
+        """One ray of each group: two numbers for its place, two for where light goes, three for where it comes from."""
         tracer = surfaces.tracer
         positions, triangle = sampler.sample(group, np.ascontiguousarray(u[:, :2]))
         weights = weights_at(tracer.corners[triangle].astype(np.float64), positions.astype(np.float64)).astype(np.float32)
@@ -145,90 +139,6 @@ class Departures:
         incoming, _ = ggx.sample(outgoing, np.ascontiguousarray(u[:, 4:]), base, gloss)
         origins = lifted(tracer, positions, tracer.normals[triangle]).astype(np.float32)
         return cls(origins, triangle, outgoing, incoming, base, gloss)
-
-
-class Arriving(NamedTuple):
-    """Light that rays find: row `row` of a table, times a factor for each channel, is the radiance that arrives along `ray`.
-
-    Attributes:
-      ray, row: indices.
-      factor: per channel.
-      table: W/m² or W/(m² sr), a lighting after another within each channel.
-    """
-
-    ray: Int32[np.ndarray, " found"]
-    row: Int32[np.ndarray, " found"]
-    factor: Float32[np.ndarray, "found 3"]
-    table: Float32[np.ndarray, "rows 3 lightings"]
-
-
-@dataclass(frozen=True, eq=False)
-class Lit:
-    """A scene as its lightmaps show it.
-
-    Attributes:
-      surfaces: its glossy triangles.
-      albedo, lamps: of what is diffuse, and of the lightings, as `walked` and `shade` ask for them.
-      landing: where on the atlas a hit lies.
-      irradiance: direct and indirect light of each texel, W/m².
-    """
-
-    surfaces: Surfaces
-    albedo: Albedo
-    lamps: Sequence[Sequence[Lamp]]
-    landing: Landing
-    irradiance: Float32[np.ndarray, "texels 3 lightings"]
-
-    @classmethod
-    def of(
-        cls,
-        tracer: Tracer,
-        scene: Scene,
-        atlas: Atlas,
-        lightings: Sequence[Lighting],
-        irradiance: Float32[np.ndarray, "texels 3 lightings"],
-    ) -> "Lit":
-        """A scene, lightings in world space, and the light that they bring to an atlas."""
-        lamps = [[(light, shift(light)) for light in centred(tracer, lighting)] for lighting in lightings]
-        landing = Landing.of(atlas, np.arange(atlas.count, dtype=np.int32))
-        return cls(Surfaces.of(tracer, scene), albedo_of(scene), lamps, landing, irradiance)
-
-    def arriving(
-        self,
-        origins: Float32[np.ndarray, "rays 3"],
-        directions: Float32[np.ndarray, "rays 3"],
-        alive: Int[np.ndarray, " alive"],
-        walk: np.random.Generator,
-        chance: np.random.Generator,
-    ) -> Iterator[Arriving]:
-        """What rays find; those that meet something glossy go on from there until they land on something that is not.
-
-        Args:
-          origins, directions: of rays; centred frame.
-          alive: indices of those that are followed.
-          walk, chance: random numbers of what goes on, and of lights at glossy surfaces.
-        """
-        tracer, ray = self.surfaces.tracer, alive.astype(np.int32)
-        origins, directions, throughput = origins[ray], directions[ray], np.ones((3, len(ray)), np.float32)
-        sums: Float64[np.ndarray, "lightings rays 3"] | None = None
-        while len(ray):
-            triangle, u, v, _ = tracer.first(origins, directions)
-            cells = landed_on(tracer, self.landing, directions, triangle, u, v)
-            triangle, met = self.surfaces.met(triangle, u, v, directions, throughput, ray)
-            lit = np.flatnonzero((triangle >= 0) & (cells >= 0))
-            colour = self.albedo(triangle[lit], u[lit], v[lit])
-            yield Arriving(ray[lit], cells[lit], throughput[:, lit].T * colour / np.float32(np.pi), self.irradiance)
-            if met is None:
-                break
-            sums = np.zeros((len(self.lamps), alive.max() + 1, 3)) if sums is None else sums
-            for part in met.blocks():
-                shade(tracer, self.lamps, part, chance, sums)
-            origins, directions, throughput, ray = met.go_on(walk)
-        if sums is not None:
-            seen = np.flatnonzero(sums.any((0, 2))).astype(np.int32)
-            table = np.ascontiguousarray(sums[:, seen].transpose(1, 2, 0), np.float32)
-            factor = np.full((len(seen), 3), 1 / np.pi, np.float32)  # paths count irradiance, spread over by cosine
-            yield Arriving(seen, np.arange(len(seen), dtype=np.int32), factor, table)
 
 
 def trace_exitant(
@@ -249,7 +159,7 @@ def trace_exitant(
     Args:
       lit, exits: the scene, its lightings, and the places.
       out: written in place, W/(m² sr), (order + 1)² entries for each place that is wanted; may lie on disk.
-      samples: paths per place.
+      samples: rays per place.
       seed, stream: address of the random numbers; another stream gives independent noise.
       skip: tiles that `out` holds already.
       chosen: the places that are wanted; None for all.
@@ -364,11 +274,11 @@ def _add(
 
 
 def choose_samples(lit: Lit, exits: Exits, *, target: float, seed: int, stream: str) -> tuple[int, float]:
-    """Paths per place that a target for the noise takes, measured at a few places, and the noise to expect.
+    """Rays per place that a target for the noise takes, measured at a few places, and the noise to expect.
 
     Args:
       lit, exits: see `trace_exitant`.
-      target: RMSE over all directions, places and lightings as a share of the mean; more than so many thousand paths are never
+      target: RMSE over all directions, places and lightings as a share of the mean; more than so many thousand rays are never
         chosen.
       seed, stream: address of the random numbers; independent of those of `trace_exitant` with that stream.
     """
