@@ -17,7 +17,7 @@ from ddprt.dataset.grids import nearest_valid
 from ddprt.dataset.layers import LayerData
 from ddprt.dataset.manifest import layer_name
 from ddprt.dataset.store import Dataset, expected_files
-from ddprt.export.probes import export_probes
+from ddprt.export.layers import export_layers
 from ddprt.files import read_tensors
 from ddprt.report.layers import layer_scores
 from ddprt.runtime.model import Model
@@ -145,7 +145,7 @@ def test_it_comes_on_top_of_what_lamps_change(model: Model, data: Dataset, tmp_p
 
 
 def test_the_documented_decoder_adds_it(model: Model, data: Dataset, tmp_path: Path) -> None:
-    export_probes(model, tmp_path)
+    export_layers(model, tmp_path)
     block = re.search(r"```python\n((?:(?!```).)*?def probes.*?)```", DOCS.read_text(), re.DOTALL)
     assert block
     scope: dict[str, Any] = {}
@@ -160,7 +160,7 @@ def test_the_documented_decoder_adds_it(model: Model, data: Dataset, tmp_path: P
     ones = np.full((16, 3), golden["x"])
     size = np.abs(part.predict(ones)).max()
     np.testing.assert_allclose(scope["probes"](tmp_path, ones, golden["normal"]), golden["irradiance"], atol=100 * EPS * size)
-    export_probes(replace(model, layers={"probes": replace(part, model=replace(part.model, constant=None))}), tmp_path)
+    export_layers(replace(model, layers={"probes": replace(part, model=replace(part.model, constant=None))}), tmp_path)
     assert "constant" not in read_tensors(tmp_path / "probes.safetensors")
 
 

@@ -6,7 +6,7 @@ coefficients are entries as texels are, so basis and transfer stay what they are
 of texels alone.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -78,6 +78,25 @@ def write_light(folder: Path, layer: str, index: int | str, light: np.ndarray, m
     manifest.add(name)
 
 
+def write_halves(
+    folder: Path,
+    layer: str,
+    indices: Sequence[int],
+    halves: Callable[[int], Sequence[np.ndarray]],
+    manifest: Manifest,
+) -> None:
+    """Coefficients of lightings: what `halves` gives for one, or of two the mean as "light" and half the difference as "noise".
+
+    Raises:
+      UserError: not finite.
+    """
+    for index in indices:
+        parts = halves(index)
+        write_light(folder, layer, index, parts[0] if len(parts) == 1 else (parts[0] + parts[1]) / 2, manifest)
+        if len(parts) > 1:
+            write_light(folder, layer, index, (parts[0] - parts[1]) / 2, manifest, "noise")
+
+
 def read_layer(data: Dataset, name: str) -> Layer:
     """A layer of a dataset.
 
@@ -93,8 +112,9 @@ def read_layer(data: Dataset, name: str) -> Layer:
 
 
 def layers(data: Dataset) -> list[Layer]:
-    """All that a dataset has."""
-    return [read_layer(data, entry["name"]) for entry in data.description.get("layers", [])]
+    """All that a dataset has, but those without places: of gloss that nobody sees."""
+    found = [read_layer(data, entry["name"]) for entry in data.description.get("layers", [])]
+    return [layer for layer in found if len(layer.position)]
 
 
 def read_light(

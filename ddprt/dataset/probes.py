@@ -14,8 +14,8 @@ import numpy as np
 
 from ddprt.axes import Float32
 from ddprt.config import Config
-from ddprt.dataset.layers import Layer, read_layer, write_light, write_places
-from ddprt.dataset.manifest import Manifest, layer_name
+from ddprt.dataset.layers import Layer, read_layer, write_halves, write_light, write_places
+from ddprt.dataset.manifest import Manifest, layer_lacks, layer_name
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.progress import Progress
@@ -137,8 +137,7 @@ class ProbeBake:
           dark: no light leaves a surface, or none is to be followed.
         """
         kinds = ("light", "noise")[: 1 + (split == "test")]
-        names = {index: [layer_name(NAME, index, kind) for kind in kinds] for index in indices}
-        todo = [index for index in indices if not all(map(self.manifest.holds, names[index]))]
+        todo = layer_lacks(self.manifest, NAME, kinds, indices)
         if not todo:
             return
         valid = self.layer.weight > 0
@@ -154,11 +153,9 @@ class ProbeBake:
                         rays = self._rays(source, len(kinds), stage)
                         stage.pace(len(kinds) * rays * int(valid.sum()))
                     light[:, valid] = self._gathered(source, rays, stage)
-            for index in todo:
-                parts = [half[indices.index(index)] for half in halves]
-                both = [sum(parts) / len(parts), (parts[0] - parts[-1]) / 2]
-                for kind, values in zip(kinds, both, strict=False):
-                    write_light(self.dataset.folder, NAME, index, values, self.manifest, kind)
+            write_halves(
+                self.dataset.folder, NAME, todo, lambda index: [half[indices.index(index)] for half in halves], self.manifest
+            )
             stage.facts["rays"] = self.tracer.rays - before
         self._name_shut(progress)
 

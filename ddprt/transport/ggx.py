@@ -19,7 +19,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ddprt.axes import Float, Float32, Float64
+from ddprt.axes import Float, Float32, Float64, Int
 from ddprt.compiled import compiled
 
 SMOOTHEST = 0.05
@@ -65,6 +65,28 @@ def pdf(outgoing: Directions, incoming: Directions, base: Directions, gloss: Dir
     density = np.empty(len(outgoing), np.float32)
     _pdf(outgoing, incoming, base, gloss, *tables(), density)
     return density
+
+
+def shared(
+    incoming: Directions,
+    base: Directions,
+    gloss: Directions,
+    group: Int[np.ndarray, "n 2"],
+    outgoing: Float[np.ndarray, "all 3"],
+    factor: Float[np.ndarray, "all factors"],
+) -> Float32[np.ndarray, "n factors 3"]:
+    """What light from each incoming direction is worth to sums over outgoing ones, by the balance heuristic.
+
+    Args:
+      incoming, base, gloss: n directions that `sample` drew for outgoing ones of their groups, one for each, and surfaces.
+      group: first and last but one of each one's group among the outgoing directions.
+      outgoing, factor: all directions, and how often each counts in each of the sums.
+    Returns:
+      The sum over a group of factor times `evaluate`, over the sum of `pdf`; 0 for directions below the surface.
+    """
+    worth = np.empty((len(incoming), factor.shape[1], 3), np.float32)
+    _shared(incoming, base, gloss, group, outgoing, factor, *tables(), worth)
+    return worth
 
 
 def sample_visible(
@@ -312,3 +334,37 @@ def _sample(
             f0 = gloss[i, 2] + gloss[i, 1] * (base[i, channel] - gloss[i, 2])
             value = f0 * mirrored + grazing + base[i, channel] * diffuse
             weight[i, channel] = value / density if density > 0 else 0.0
+
+
+@compiled
+def _shared(
+    incoming: np.ndarray,
+    base: np.ndarray,
+    gloss: np.ndarray,
+    group: np.ndarray,
+    outgoing: np.ndarray,
+    factor: np.ndarray,
+    table: np.ndarray,
+    means: np.ndarray,
+    worth: np.ndarray,
+) -> None:
+    factors = factor.shape[1]
+    sums = np.empty((3, factors))
+    for i in range(len(incoming)):
+        worth[i] = 0
+        if not incoming[i, 2] > 0:
+            continue
+        sums[:] = 0
+        total = 0.0
+        for j in range(group[i, 0], group[i, 1]):
+            mirrored, grazing, diffuse, density = _terms(outgoing[j], incoming[i], base[i], gloss[i], table, means)
+            total += density
+            for k in range(factors):
+                sums[0, k] += factor[j, k] * mirrored
+                sums[1, k] += factor[j, k] * grazing
+                sums[2, k] += factor[j, k] * diffuse
+        if total > 0:
+            for channel in range(3):
+                f0 = gloss[i, 2] + gloss[i, 1] * (base[i, channel] - gloss[i, 2])
+                for k in range(factors):
+                    worth[i, k, channel] = (f0 * sums[0, k] + sums[1, k] + base[i, channel] * sums[2, k]) / total

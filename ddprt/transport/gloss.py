@@ -142,6 +142,13 @@ class Surfaces:
         directions: Float32[np.ndarray, "n 3"],
     ) -> Lobes:
         """Surfaces that rays of some directions hit, all of them glossy and from their front."""
+        frames = self.tracer.frames[triangle]
+        return Lobes(frames, _to_local(-directions, frames), *self.finish(triangle, u, v))
+
+    def finish(
+        self, triangle: Int32[np.ndarray, " n"], u: Float32[np.ndarray, " n"], v: Float32[np.ndarray, " n"]
+    ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
+        """Base colour and gloss at places of glossy triangles."""
         weights = np.stack([1 - u - v, u, v], 1)
         base, gloss = self.scene.albedo_at(triangle, weights).astype(np.float32), self.gloss[triangle]
         for index, material in enumerate(self.scene.materials):
@@ -149,8 +156,7 @@ class Surfaces:
                 chosen = self.scene.material[triangle] == index
                 uv = self.scene.uv_at(triangle[chosen], weights[chosen])
                 gloss[chosen, :2] *= bilinear(material.gloss.texture, uv)
-        frames = self.tracer.frames[triangle]
-        return Lobes(frames, _to_local(-directions, frames), base, gloss)
+        return base, gloss
 
     def met(
         self,
