@@ -60,5 +60,47 @@ def clamped_cosine(order: int) -> Float64[np.ndarray, " harmonics"]:
     return np.array(bands)
 
 
+def of_panorama(radiance: Float[np.ndarray, "height width channels"], order: int) -> Float64[np.ndarray, "harmonics channels"]:
+    """Integral over the sphere of a picture times each harmonic: its coefficients, sr times its unit.
+
+    Exact for a picture that is constant within each pixel. Along a row harmonics are sums of sines and cosines of up to `order`
+    turns, whose integrals over a pixel are known; down a row Gauss' rule leaves less than rounding.
+
+    Args:
+      radiance: equirectangular, as `EnvironmentLight` has it: row 0 about +Y, the middle of a row at -Z, its right half at +X.
+      order: of the harmonics.
+    """
+    height, width = radiance.shape[:2]
+    waves = np.arange(1, order + 1)
+    edges = 2 * np.pi * (np.arange(width + 1) / width - 0.5)
+    sines, cosines = np.diff(np.sin(np.outer(waves, edges))) / waves[:, None], np.diff(np.cos(np.outer(waves, edges)))
+    pixels = np.concatenate([np.full((1, width), 2 * np.pi / width), sines, -cosines / waves[:, None]])
+    along = np.tensordot(pixels, radiance.astype(np.float64), (1, 1))  # of cosines and sines, for each row
+
+    x, weight = np.polynomial.legendre.leggauss(8 + 4 * (order + 1) // height)
+    polar = np.pi * (np.arange(height)[:, None] + (x + 1) / 2) / height
+    turn = np.pi * np.arange(2 * order + 2) / (order + 1)  # enough to tell sums of `order` turns
+    flat = np.sin(polar)[..., None]
+    towards = np.broadcast_arrays(flat * np.sin(turn), np.cos(polar)[..., None], -flat * np.cos(turn))
+    angles = np.outer(waves, turn)
+    told = np.concatenate([np.full((1, len(turn)), 0.5), np.cos(angles), np.sin(angles)]) / (order + 1)
+    down = weight * np.sin(polar) * np.pi / 2 / height
+    return np.einsum("hg,hgtk,mt,mhc->kc", down, harmonics(np.stack(towards, -1), order), told, along, optimize=True)
+
+
+def turned(coefficients: Float64[np.ndarray, "harmonics channels"], angle: float) -> Float64[np.ndarray, "harmonics channels"]:
+    """Those of the same function turned about +Y, right-handed, radians."""
+    order = round(len(coefficients) ** 0.5) - 1
+    height, weight = np.polynomial.legendre.leggauss(order + 1)  # this rule integrates products of two harmonics exactly
+    turn = 2 * np.pi * np.arange(2 * order + 1) / (2 * order + 1)
+    flat = np.sqrt(1 - height**2)[:, None]
+    directions = np.stack(np.broadcast_arrays(flat * np.cos(turn), height[:, None], flat * np.sin(turn)), -1)
+    cosine, sine = np.cos(angle), np.sin(angle)
+    about_y = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+    share = (weight * 2 * np.pi / len(turn))[:, None, None]
+    values = harmonics(directions, order) @ coefficients * share
+    return np.einsum("gtk,gtc->kc", harmonics(directions @ about_y.T, order), values, optimize=True)
+
+
 def _double_factorial(number: int) -> float:
     return float(np.prod(np.arange(number, 0, -2, dtype=np.float64)))

@@ -202,12 +202,12 @@ class Run:
 
     def export(self, model: Any) -> list[Path]:
         """Writes what engines load."""
-        from ddprt.export.probes import export_probes
+        from ddprt.export.layers import export_layers
         from ddprt.export.textures import export_textures
 
         with self.progress.stage("export"):
             files = export_textures(model, self.folder / "export", **self.config.export.model_dump())
-            export_probes(model, self.folder / "export")
+            export_layers(model, self.folder / "export")
         seams = json.loads(files[-1].read_text())["seams"]
         if self.config.export.stitch and not seams["stitched"]:
             self.progress.warn(f"export.stitch: seams stay open: {seams['why']}")

@@ -160,6 +160,9 @@ class EffectsConfig(Section):
 
     on: tuple[str, ...] = Field((), description="effects to simulate though the scene does not call for them")
     off: tuple[str, ...] = Field((), description="effects to leave out though the scene calls for them")
+    glossy_layers: bool = Field(
+        True, description="keep what the eye sees on glossy texels, beside the lightmap that they light"
+    )
 
 
 class ProbesConfig(Section):
@@ -221,6 +224,9 @@ class ReportConfig(Section):
     """What the report shows."""
 
     rows: int = Field(4, ge=1, le=64, description="held-out lightings shown as pictures")
+    views: tuple[tuple[float, float, float], ...] = Field(
+        (), description="places (metres) to see what is glossy, or the whole, from; none: as usual, and two near to gloss"
+    )
     bases_curve: tuple[Annotated[int, Field(ge=1)], ...] = Field(
         (4, 8, 16, 32, 64), min_length=1, description="numbers of bases on the error curve"
     )

@@ -2,6 +2,7 @@
 
 Question: noise of direct irradiance on texels at equal time, a sample of every light against Mitsuba's choice among emitters.
 Command:  python experiments/area_lights.py [resolution]
+          python experiments/area_lights.py near              one large lamp close to surfaces, by area and by solid angle
 Answer:   docs/effects.md
 
 Both bake the Cornell box under the same 32 rectangles on the same texels, places laid out before the clock starts. ddprt takes
@@ -20,7 +21,7 @@ import numpy as np
 from peer_mitsuba import load_mitsuba
 
 from ddprt import seeds, warp
-from ddprt.lights import Lighting, parse_lighting
+from ddprt.lights import Lighting, area, parse_lighting
 from ddprt.scene.atlas import Atlas, build_atlas
 from ddprt.scene.library import build
 from ddprt.scene.mesh import Scene
@@ -167,5 +168,24 @@ def main(resolution: int) -> None:
     print(f"least error x root of seconds, ours over theirs: {min(costs['ddprt']) / min(costs['mitsuba']):.2f}")
 
 
+def near() -> None:
+    """Error and seconds of lamps close to the walls, sampled by area everywhere and as `lights/area.py` does."""
+    scene = build("cornell")
+    tracer, atlas, usual = Tracer.of(scene), build_atlas(scene, 64), area._NEAR
+    for half, height in ((0.05, 0.54), (0.2, 0.54), (0.1, 0.01)):
+        sides = {"half_u": [half, 0, 0], "half_v": [0, 0, half]}
+        middle = [0.278, height, 0.28] if height > 0.1 else [0.1, height, 0.12]
+        lighting = parse_lighting({"type": "rect", "center": middle, **sides, "radiance": [5, 5, 5]})
+        for samples in (4, 16):
+            for name, area._NEAR in (("by area", 0.0), ("by solid angle where near", usual)):
+                maps, seconds = ours(tracer, atlas, lighting, samples)
+                error = spread(maps, atlas.area)
+                way = f"{100 * half:3.0f} cm half, at {height} m, {samples:2} samples, {name}"
+                print(f"{way:62} {error:.4f}  {seconds:.4f} s  {error * seconds**0.5:.5f}")
+
+
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else RESOLUTION)
+    if sys.argv[1:] == ["near"]:
+        near()
+    else:
+        main(int(sys.argv[1]) if len(sys.argv) > 1 else RESOLUTION)

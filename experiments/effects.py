@@ -4,15 +4,15 @@ Question: is each effect right, and does an effect that nobody calls for cost an
 Command:  python experiments/effects.py [--quick]     the last line is JSON
 Answer:   docs/effects.md
 
-`effects` holds the largest relative error against a closed form, or mean and standard deviation of z-scores against another
-renderer, by name of the effect; those without a figure are named. `zero_cost_ratio` is the time of a diffuse bake with
-all files of effects imported over its time in a process where they raise on import: both processes take turns, and it is the
-median of the ratios of turns. `unused_effect_rays` is how many rays more the former traces.
+`effects` holds by name of the effect the largest relative error against a closed form, with the standard error of what is
+sampled (`effect_figures.py`), and without --quick mean and standard deviation of z-scores against Mitsuba, if it is installed
+(`effect_mitsuba.py`). An effect without a figure ends the experiment before it begins. `zero_cost_ratio` is the time of a
+diffuse bake with all files of effects imported over its time in a process where they raise on import: both processes take
+turns, and it is the median of the ratios of turns. `unused_effect_rays` is how many rays more the former traces.
 """
 
 import importlib
 import json
-import math
 import subprocess
 import sys
 import tempfile
@@ -27,12 +27,11 @@ import numpy as np
 import ddprt
 from ddprt.config import Config, checked
 from ddprt.dataset.generate import bake
+from ddprt.errors import UserError
 from ddprt.progress import Progress
 from ddprt.scene.mesh import Scene
-from ddprt.scene.shapes import faceted, rectangle
 from ddprt.transport.effects import EFFECTS
 
-Figure = dict[str, float]
 TURNS, QUICK_TURNS = 21, 9
 DIFFUSE: dict[str, Any] = {
     "atlas": {"resolution": 48},
@@ -40,73 +39,6 @@ DIFFUSE: dict[str, Any] = {
     "points": {"count": 32, "supersample": 2},
     "transport": {"samples": 128, "test_samples": 128, "threads": 2},
 }
-
-
-# --- figures of effects --------------------------------------------------------------------------------------------------
-
-
-def ground() -> Scene:
-    """A black square, 20 m wide, that looks up."""
-    square = rectangle((-10.0, -10.0), (10.0, 10.0), 0.0, 1, facing=1)
-    return faceted("ground", np.array([square]), (ddprt.load_scene("furnace", albedo=0, subdivisions=1).materials[0],))
-
-
-def lit(light: dict[str, Any], samples: int) -> float:
-    """Irradiance of the ground in the middle."""
-    return float(ddprt.irradiance(ground(), light, [[0.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]], samples=samples)[0][0, 1])
-
-
-def against(found: float, expected: float) -> Figure:
-    return {"closed_form_error": abs(found / expected - 1)}
-
-
-def bounces(quick: bool) -> Figure:
-    """A sphere of albedo a, lit from its middle: indirect light is a / (1 - a) times the direct."""
-    scene = ddprt.load_scene("furnace", albedo=0.5, subdivisions=3)
-    lamp = {"type": "point", "position": [0, 0, 0], "intensity": [1, 1, 1]}
-    rng = np.random.default_rng(0)
-    triangle = rng.choice(len(scene.areas), 256, p=scene.areas / scene.areas.sum())
-    place, normal = scene.corners[triangle].mean(1), scene.geometric_normals[triangle]
-    _, indirect = ddprt.irradiance(scene, lamp, place, normal, samples=400 if quick else 6400)
-    return against(float(indirect.mean()), 4 * math.pi / scene.areas.sum())
-
-
-def point(quick: bool) -> Figure:
-    return against(lit({"type": "point", "position": [0.6, 0.8, 0], "intensity": [2, 2, 2]}, 1), 2 * 0.8)
-
-
-def spot(quick: bool) -> Figure:
-    light = {"type": "spot", "position": [0.6, 0.8, 0], "direction": [-0.6, -0.8, 0], "intensity": [2, 2, 2]}
-    return against(lit({**light, "inner_deg": 10, "outer_deg": 30}, 1), 2 * 0.8)
-
-
-def directional(quick: bool) -> Figure:
-    return against(lit({"type": "directional", "direction": [0.6, -0.8, 0], "irradiance": [3, 3, 3]}, 1), 3 * 0.8)
-
-
-def rect(quick: bool) -> Figure:
-    """Parallel, above a corner: Lambert's formula for a quarter, four times."""
-    half, height = 0.5, 1.0
-    x = half / math.hypot(half, height)
-    quarter = x * math.atan(x) / math.pi  # both terms of the corner's factor are alike in a square
-    light = {"type": "rect", "center": [0, height, 0], "half_u": [half, 0, 0], "half_v": [0, 0, half], "radiance": [1, 1, 1]}
-    return against(lit(light, 1 << 16 if quick else 1 << 20), math.pi * 4 * quarter)
-
-
-def sphere(quick: bool) -> Figure:
-    light = {"type": "sphere", "center": [0.6, 0.8, 0], "radius": 0.25, "radiance": [1, 1, 1]}
-    return against(lit(light, 1 << 12 if quick else 1 << 16), math.pi * 0.25**2 * 0.8)
-
-
-FIGURES: dict[str, Callable[[bool], Figure]] = {
-    "diffuse bounces": bounces,
-    "point lights": point,
-    "spot lights": spot,
-    "directional lights": directional,
-    "rect lights": rect,
-    "sphere lights": sphere,
-}
-"""What tells of each effect that it is right: `closed_form_error`, or `z_mean` and `z_std`. A new effect is one entry more."""
 
 
 # --- what nobody calls for -----------------------------------------------------------------------------------------------
@@ -126,6 +58,8 @@ class Absent(MetaPathFinder):
 def serve(way: str) -> None:
     """Bakes the diffuse scene whenever a line comes in, and answers with seconds and rays."""
     modules = sorted({f"ddprt.transport.{entry.module}" for entry in EFFECTS.values() if entry.module})
+    if early := set(modules) & set(sys.modules):
+        raise SystemExit(f"effects {way}: {', '.join(sorted(early))} imported before any bake")
     if way == "absent":
         sys.meta_path.insert(0, Absent(modules))
     else:
@@ -185,17 +119,32 @@ def main() -> None:
     if "--serve" in sys.argv:
         serve(sys.argv[-1])
         return
+    from effect_figures import FIGURES  # not above: the bakes without effects import nothing of them
+
     quick = "--quick" in sys.argv
+    if missing := [name for name in EFFECTS if name not in FIGURES]:
+        raise SystemExit(f"effects: no figure for {', '.join(missing)}; add one to experiments/effect_figures.py")
+    opinion = None if quick else second_opinions()
     figures = {}
     for name in EFFECTS:
-        if name not in FIGURES:
-            print(f"{name}: no figure here")
-            continue
         begun = time.perf_counter()
-        figures[name] = {key: float(f"{value:.3g}") for key, value in FIGURES[name](quick).items()}
+        figure = FIGURES[name](quick) | ((opinion(name) if opinion else None) or {})
+        figures[name] = {key: float(f"{value:.3g}") for key, value in figure.items()}
         told = ", ".join(f"{key} {value:g}" for key, value in figures[name].items())
         print(f"{name}: {told} ({time.perf_counter() - begun:.1f} s)", flush=True)
     print(json.dumps({"effects": figures, **zero_cost(QUICK_TURNS if quick else TURNS)}))
+
+
+def second_opinions() -> Callable[[str], dict[str, float] | None] | None:
+    """Mitsuba's, where it is installed; where not, that is said."""
+    from effect_mitsuba import load_mitsuba, second_opinion
+
+    try:
+        load_mitsuba()
+    except UserError as error:
+        print(f"no second opinion: {error}")
+        return None
+    return second_opinion
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from statistics import median
 from typing import Any
 
 from ddprt.config import load_config
+from ddprt.dataset.store import CONSTANT
 from ddprt.pipeline import Run
 from ddprt.scene.library import SCENES
 
@@ -34,6 +35,8 @@ JOBS: dict[str, dict[str, Any]] = {
     **{f"cornell {side}": {"atlas.resolution": side} for side in (64, 128, 512)},
     "cornell 16 lightings": {"lightings.train": 16, "lightings.validation": 2, "lightings.test": 4},
     "all kinds": {"lightings.kinds": '["point", "spot", "directional", "rect", "sphere"]', "lightings.lights": "[1, 3]"},
+    "probes": {"atlas.resolution": 96, "lightings.train": 64, "probes.grid": "[6, 6, 6]", "transport.target_noise": 0.02},
+    "neon with probes": {"scene.name": "neon", "atlas.resolution": 96, "probes.grid": "[5, 5, 5]"},
     "paths": {"transport.integrator": "paths", "atlas.resolution": 64, "transport.target_noise": 0.05},
     "reference": {
         "transport.integrator": "reference",
@@ -69,6 +72,10 @@ def one(kind: str, changes: dict[str, str], folder: str) -> dict[str, Any]:
         test = name == "indirect" and int(path.stem) in data.split("test")
         own = {"direct": "direct", "measured": "direct", "noise": "indirect test"}.get(name, "files")
         own = ("indirect test" if test else "indirect train") if name == "indirect" else own
+        if name == "probes" and path.stem != "places":
+            held = path.stem.split(".")[0]
+            own = "emission" if held == "constant" else f"probes {'test' if int(held) in data.split('test') else 'train'}"
+        own = "emission" if path.name == CONSTANT else own
         baked[own][2] += 1
         baked[own][3] += path.stat().st_size
     peak = json.loads((run.folder / "run.json").read_text())["peak_memory_gib"]

@@ -9,7 +9,8 @@ that of all cores together, shadow rays included. Noise is that of one map by tw
 counts: where errors fall with the root of the number of samples it does not depend on that number. Samples are spread evenly on
 both sides, so that it falls, and rows of about equal time are to be compared. Needs the extra "reference" for Mitsuba's rows.
 
-Ours: the sampler of `lights/sky.py`; pixels by luminance alone; the cosine alone; half of both without taking the mean off.
+Ours: the sampler of `lights/sky.py`; pixels by luminance alone; the cosine alone; what exceeds half, or twice, of the mean as
+the bright part.
 Mitsuba: emitter sampling alone; emitter and cosine, a sample of each, combined by the balance heuristic; the same with its
 `mis_compensation`.
 """
@@ -58,8 +59,12 @@ def by_cosine(found: sky.Sky) -> sky.Sky:
     return replace(found, share=0.0)
 
 
-def half_and_half(found: sky.Sky) -> sky.Sky:
-    return with_mean(found, 0.0, 0.5)
+def above_half(found: sky.Sky) -> sky.Sky:
+    return with_mean(found, found.mean / 2, 0.5)
+
+
+def above_twice(found: sky.Sky) -> sky.Sky:
+    return with_mean(found, 2 * found.mean, 0.5)
 
 
 def with_mean(found: sky.Sky, mean: float, share: float) -> sky.Sky:
@@ -171,9 +176,12 @@ def main(name: str = "statue", resolution: int = 128) -> None:
         found, load = sky.Sky.of(pixels), sky.load_sky
         for label, change in {
             "ours": None, "ours, luminance alone": by_luminance, "ours, cosine alone": by_cosine,
-            "ours, half of both": half_and_half,
+            "ours, above half the mean": above_half, "ours, above twice the mean": above_twice,
         }.items():  # fmt: skip
             changed = change(found) if change else found
+            if not changed.bright:
+                print(f"{label}: the sky is nowhere so bright")
+                continue
             sky.load_sky = lambda image, changed=changed: changed  # type: ignore[assignment]
             rows(label, ours(tracer, atlas))
         sky.load_sky = load

@@ -22,6 +22,7 @@ from ddprt.config import load_config
 from ddprt.errors import UserError
 from ddprt.export.textures import LAYER, export_textures
 from ddprt.fitting.transfer import fit_transfer
+from ddprt.lights import lighting_json
 from ddprt.pipeline import Run
 from ddprt.runtime.model import Model
 from ddprt.runtime.precision import PRECISIONS, shipped_bytes, stored
@@ -71,7 +72,8 @@ class Workshop:
             run = Run(config, self.folder / baked, quiet=True)
             data = run.bake()
             model = run.fit(data)[0][config.fit.method]
-            bakery = Bakery(run.scene, config, data, self.folder / f"budget-{config.seed}", run.progress)
+            apart = f"budget-{config.seed}-{config.points.choose}-{bool(config.lightings.file)}"  # whose bakes are others
+            bakery = Bakery(run.scene, config, data, self.folder / apart, run.progress)
             self.made[key] = measure_budget(model, bakery), model, bakery
         return self.made[key]
 
@@ -301,12 +303,32 @@ def test_knobs_that_bake(workshop: Workshop) -> None:
     assert turn(knobs["noise"], budget, bakery).bake_seconds is None
 
 
-def test_points_chosen_by_lightings_are_refused(workshop: Workshop) -> None:
-    _, model, bakery = workshop()
-    chosen = bakery.config.points.model_copy(update={"choose": "qr"})
-    other = replace(bakery, config=bakery.config.model_copy(update={"points": chosen}))
-    with pytest.raises(UserError, match=r'points\.choose: got "qr", expected "blue-noise"'):
-        measure_budget(model, other)
+def test_points_chosen_by_lightings_are_taken_apart(workshop: Workshop) -> None:
+    """Every bake of the budget measures at the points that the run's training lightings chose, and at no others."""
+    even = workshop()[2].data
+    budget, _, bakery = workshop(points__choose="qr", budget__scenario="{region_low = [0.1, 0.05, 0.1]}", budget__abundance=2)
+    yard, own = budget.yardsticks, bakery.data
+    assert own.samples.digest != even.samples.digest
+    assert yard.elsewhere is not None
+    for other in (yard.clean, yard.truth, yard.elsewhere):
+        assert other.samples.digest == own.samples.digest
+        assert (other.samples.spacing, other.samples.depth) == (own.samples.spacing, own.samples.depth)
+    train = [own.lightings[index] for index in own.split("train")]
+    abundant = [yard.clean.lightings[index] for index in yard.clean.split("train")]
+    assert abundant[: yard.train] == train
+    assert len(abundant) == 2 * yard.train == len(yard.elsewhere.split("train"))
+    assert not {*map(repr, train)} & {repr(yard.elsewhere.lightings[index]) for index in yard.elsewhere.split("train")}
+    assert [yard.clean.lightings[i] for i in yard.clean.split("validation")] == [
+        own.lightings[i] for i in own.split("validation")
+    ]
+    assert len(budget.lightings) == 12
+    # Maps and measurements belong together: those of a training lighting are those of the run, but for what noise they have.
+    there, here = yard.clean.measured([0]), own.measured([0])
+    np.testing.assert_array_equal(there, here)
+    (index,) = yard.clean.split("train")[:1]
+    light, noisy = yard.clean.maps("indirect", [index]), own.maps("indirect", own.split("train")[:1])
+    other = yard.clean.maps("indirect", yard.clean.split("train")[1:2])
+    assert np.linalg.norm(light - noisy) < 0.5 * np.linalg.norm(other - noisy)
 
 
 @pytest.mark.slow
@@ -319,11 +341,52 @@ def test_chosen_lightings_are_taken_apart(workshop: Workshop) -> None:
     assert budget.parts.record()["total"]["relative_square"] > 0
 
 
-def test_lightings_of_a_file_are_refused(workshop: Workshop) -> None:
+def listed(path: Path, lightings: list[Any]) -> str:
+    path.write_text(json.dumps([lighting_json(lighting) for lighting in lightings]))
+    return str(path)
+
+
+def test_lightings_of_a_file_are_taken_apart(workshop: Workshop, tmp_path: Path) -> None:
+    """On those that the file holds out; the best transfer is fitted on them and on those of validation, and none is drawn."""
+    clean = workshop()[0].yardsticks.clean
+    kept = listed(tmp_path / "lamps.json", [*clean.lightings[: 24 + 5 + 12]])
+    words = {"lightings__file": kept, "lightings__validation": 5, "lightings__test": 12, "fit__points": 16}
+    budget, model, bakery = workshop(**words)
+    yard, own = budget.yardsticks, bakery.data
+    assert budget.lightings == [own.lightings[index] for index in own.split("test")]
+    assert len(yard.clean.split("train")) == yard.train == 24
+    fitted = [data.lightings[index] for data, indices in yard.unseen() for index in indices]
+    assert fitted == [own.lightings[index] for split in ("validation", "test") for index in own.split(split)]
+    shares = budget.parts.record()
+    assert sum(part["share"] for part in shares["parts"]) + sum(pair["share"] for pair in shares["cross_terms"]) == (
+        pytest.approx(1, abs=1e-10)
+    )
+    assert budget.parts.part("measurement") > 0
+    assert "lightings.train" not in {knob.setting for knob in weigh_knobs(budget, model, bakery)}, "there are no more to list"
+
+
+@pytest.mark.parametrize(
+    ("section", "changes", "message"),
+    [
+        (
+            "fit",
+            {"points": 0},
+            r"lightings\.file: got 3 \+ 2 of lamps\.json for validation and test, expected more than the 24",
+        ),
+        ("fit", {"points": 5}, r"expected more than the 5 points, since .* share out more of the file to lightings\.test"),
+        (
+            "budget",
+            {"scenario": {"region_low": [0.1, 0.05, 0.1]}},
+            r"budget\.scenario: got \{.*\} beside lightings\.file lamps",
+        ),
+    ],
+)
+def test_a_file_that_holds_out_too_few_is_told(workshop: Workshop, section: str, changes: dict[str, Any], message: str) -> None:
     _, model, bakery = workshop()
-    listed = bakery.config.lightings.model_copy(update={"file": "lamps.json"})
-    other = replace(bakery, config=bakery.config.model_copy(update={"lightings": listed}))
-    with pytest.raises(UserError, match=r"lightings\.file: got lamps\.json"):
+    file = bakery.config.lightings.model_copy(update={"file": "lamps.json"})
+    changed = getattr(bakery.config, section).model_copy(update=changes)
+    other = replace(bakery, config=bakery.config.model_copy(update={"lightings": file, section: changed}))
+    with pytest.raises(UserError, match=message):
         measure_budget(model, other)
 
 

@@ -150,7 +150,7 @@ def test_light_of_near_lamps_adds_up(floor: Tracer, texels: Atlas) -> None:
 def test_shifted_numbers_agree_with_loops_and_are_uniform(each: int) -> None:
     words = np.random.default_rng(0).integers(0, 1 << 32, (4000, 2), np.uint32)
     words[:2] = 0, (1 << 32) - 1
-    sequence, u = direct._sequence(each), np.zeros((2, 3000 * each), np.float32)
+    sequence, u = direct._lattice(each), np.zeros((2, 3000 * each), np.float32)
     direct._shifted(words, sequence, 1000 * each, u)
     slow = np.zeros_like(u, np.float64)
     for axis in range(2):
@@ -171,6 +171,18 @@ def test_shifted_numbers_agree_with_loops_and_are_uniform(each: int) -> None:
 def test_sequence_fills_the_square_evenly() -> None:
     for count in (4, 16, 64):
         assert stats.qmc.discrepancy(direct._sequence(count).T, method="L2-star") < 0.7 / count**0.75
+
+
+def test_places_and_parts_of_a_light_do_not_move_in_step() -> None:
+    """All four numbers of a sample together: wrap-around discrepancy, squared, falls faster than that of chance.
+
+    The mean over independent points is ((3/2)^4 - (4/3)^4) / count (Hickernell 1998). One sequence for both would give 1.2
+    times the bound at 8 points, 7 times at 64.
+    """
+    for count in (8, 16, 64, 256):
+        points = np.concatenate([direct._sequence(count), direct._lattice(count)]).T
+        chance = ((3 / 2) ** 4 - (4 / 3) ** 4) / count
+        assert stats.qmc.discrepancy(points, method="WD") < chance / np.sqrt(count)
 
 
 @pytest.mark.parametrize("block", [64, 1000, 1 << 14])

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,20 @@ from ddprt.cli import main
 from ddprt.config import load_config
 from ddprt.dataset.splits import doubt
 from ddprt.errors import UserError
-from ddprt.lights import EnvironmentLight, parse_lighting
+from ddprt.lights import EnvironmentLight, Lighting, parse_lighting
 from ddprt.lights.panorama import SKIES, read_panorama
-from ddprt.lights.sky import LUMINANCE, Sky, invert_bright, load_sky, pdf_bright, sample_bright
+from ddprt.lights.sky import (
+    LUMINANCE,
+    Sky,
+    _half_turns_down,
+    _pixel,
+    _spun,
+    _turns_of,
+    invert_bright,
+    load_sky,
+    pdf_bright,
+    sample_bright,
+)
 from ddprt.sampling.lightings import draw_lightings
 from ddprt.scene.atlas import Atlas, build_atlas
 from ddprt.scene.checks import checked
@@ -199,19 +211,19 @@ def test_the_bright_part_there_and_back(patchwork: Path) -> None:
 
 @pytest.mark.parametrize("normal", [None, UP, np.array([0.48, -0.6, 0.64])], ids=["none", "up", "aside"])
 def test_both_techniques_together_fit_their_density(patchwork: Path, normal: np.ndarray | None) -> None:
-    """Directions against share * bright + (1 - share) * cosine, and light against radiance over that very density."""
+    """Directions against share * bright + (1 - share) * cosine, and light against each one's part over its density."""
     found, turn = load_sky(str(patchwork)), 75.0
     assert found.share == 0.5
     assert load_sky("gradient").share == load_sky("white").share == 0
     towards, light = drawn(sky(str(patchwork), rotation_deg=turn), normal, 200_000, seed=3)
 
-    def density(there: np.ndarray) -> np.ndarray:
+    def densities(there: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         rest = np.full(len(there), 1 / (4 * np.pi)) if normal is None else np.maximum(there @ normal, 0) / np.pi
-        return found.share * pdf_bright(found, there @ about_y(turn)) + (1 - found.share) * rest
+        return found.share * pdf_bright(found, there @ about_y(turn)), (1 - found.share) * rest
 
     fine = 8
     unturned, solid_angle = directions(*found.radiance.shape[:2], fine)
-    shares = solid_angle * density(unturned.reshape(-1, 3) @ about_y(turn).T).reshape(solid_angle.shape)
+    shares = solid_angle * sum(densities(unturned.reshape(-1, 3) @ about_y(turn).T)).reshape(solid_angle.shape)
     height, width = found.radiance.shape[:2]
     shares = shares.reshape(height, fine, width, fine).sum((1, 3))
     assert shares.sum() == pytest.approx(1, abs=1e-3)  # the horizon cuts through fine pixels
@@ -221,9 +233,15 @@ def test_both_techniques_together_fit_their_density(patchwork: Path, normal: np.
         (np.arccos(np.clip(towards[:, 1], -1, 1)) / np.pi * height,
          ((np.arctan2(*(towards @ about_y(turn)).T[[0, 2]] * [[1], [-1]]) / (2 * np.pi) + 0.5) % 1) * width),
         (height, width), strict=True))  # fmt: skip
-    expected = found.radiance[row, column] / density(towards)[:, None]
+    luminance = found.radiance[row, column] @ LUMINANCE
+    from_bright = np.random.default_rng(3).random((200_000, 2))[:, 0] < found.share
+    part = np.where(from_bright, np.maximum(luminance - found.mean, 0), np.minimum(luminance, found.mean))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        expected = found.radiance[row, column] * (part / luminance / np.where(from_bright, *densities(towards)))[:, None]
+    expected[luminance == 0] = 0
     edge = abs(expected - light).max(1) > 1e-9 * (1 + expected.max(1))
     assert edge.mean() < 1e-3, "but for samples on the very edge of a pixel"
+    assert 0.4 < from_bright.mean() < 0.6
 
 
 def test_samples_are_spent_on_the_sun_and_on_what_faces_the_surface() -> None:
@@ -238,6 +256,56 @@ def test_samples_are_spent_on_the_sun_and_on_what_faces_the_surface() -> None:
     # Light alone gives 1.09 and 1.02, the cosine alone 0.24 and 13 (docs/effects.md): both techniques are at work.
     assert deviation("gradient") < 0.6
     assert deviation("sun-sky") < 0.6
+
+
+@pytest.mark.parametrize("normal", [None, UP])
+def test_no_direction_outweighs_the_others(normal: np.ndarray | None) -> None:
+    """A sample brings the bright part's flux over its share, or at most the mean over the density of the rest; never both."""
+    found = load_sky("sun-sky")
+    towards, light = drawn(sky("sun-sky"), normal, 1 << 16)
+    share = found.share
+    from_bright = np.random.default_rng(0).random((1 << 16, 2))[:, 0] < share
+    brought = light @ LUMINANCE * (1 if normal is None else np.abs(towards @ normal))
+    whole = 4 * np.pi if normal is None else np.pi
+    np.testing.assert_allclose((light @ LUMINANCE)[from_bright], found.bright / share, rtol=1e-12)
+    assert brought[~from_bright].max() <= found.mean * whole / (1 - share) * (1 + 1e-12)
+    hit = found.radiance[*_pixel(found, towards)[:2]].max(1) > 700
+    assert hit[~from_bright].any(), "of 32768 directions some hit the sun, a thousandth of the sphere"
+
+
+def test_angles_are_as_exact_as_said() -> None:
+    rng = np.random.default_rng(0)
+    x, z = rng.normal(size=(2, 2000))
+    x[:8], z[:8] = [0, 0, 1, -1, 1e-9, -1e-9, 1, 1], [1, -1, 0, 0, 1, -1, 1, -1]
+    found = np.array([_turns_of(*pair) for pair in zip(x.tolist(), z.tolist(), strict=True)])
+    away = abs(found - np.arctan2(x, z) / (2 * np.pi))
+    assert np.minimum(away, 1 - away).max() < 5e-10
+    y = np.concatenate([[-1, 0, 1, 1 - 1e-16, 1e-9 - 1], rng.uniform(-1, 1, 2000)])
+    down = [_half_turns_down(height) for height in y.tolist()]
+    np.testing.assert_allclose(down, np.arccos(y) / np.pi, rtol=0, atol=1e-8)
+    turns = rng.uniform(-3, 3, 2000)
+    np.testing.assert_allclose(
+        [_spun(turn) for turn in turns.tolist()],
+        np.stack([np.cos(2 * np.pi * turns), np.sin(2 * np.pi * turns)], 1),
+        atol=1e-14,
+    )
+
+
+def test_bits_do_not_depend_on_the_threads() -> None:
+    scene = build("statue", subdivisions=2)
+    maps = []
+    for threads in (1, 2):
+        tracer = Tracer.of(scene, threads)
+        texels = Texels.of(tracer, build_atlas(scene, 24, 2), 16, seeds.stream(0, "a"))
+        lightings = [parse_lighting(sky("sun-sky", rotation_deg=turn)) for turn in (0.0, 50.0, 100.0, 150.0)]
+        work = partial(_one, texels)
+        maps.append(np.array(list(tracer.map(work, enumerate(lightings)))))
+    np.testing.assert_array_equal(*maps)
+
+
+def _one(texels: Texels, numbered: tuple[int, Lighting]) -> np.ndarray:
+    index, lighting = numbered
+    return texels.irradiance(lighting, seeds.stream(1, "b", index))
 
 
 @pytest.mark.parametrize("samples", [2, 4, 16, 64])

@@ -1,12 +1,12 @@
 """Sweeps: what is tried, what is noted, and how one that was stopped goes on."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -382,7 +382,8 @@ def test_a_killed_sweep_goes_on(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "ddprt", *words]
 
     def stopped(how: signal.Signals, after: int) -> int:
-        process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL, env={**os.environ})
+        heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # shells let what they start in the background ignore it
+        process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL, preexec_fn=heard)
         patience = time.monotonic() + 120
         while (not results.exists() or len(results.read_text().splitlines()) < after) and time.monotonic() < patience:
             assert process.poll() is None

@@ -7,14 +7,14 @@ from typing import Any
 import mpmath
 import numpy as np
 import pytest
-from oracles import above_horizon, polygon_irradiance
+from oracles import above_horizon, chi_square, polygon_irradiance
 from pydantic import ValidationError
 
 from ddprt import warp
 from ddprt.dataset.splits import doubt, grouped
 from ddprt.errors import UserError
 from ddprt.lights import LIGHTS, Light, lighting_json, load_lightings, parse_lighting
-from ddprt.lights.area import _turned
+from ddprt.lights.area import _solid_angle, _turned, invert_rectangle, pdf_rectangle, sample_rectangle
 from ddprt.lights.light import Illumination
 from ddprt.scene.library import build
 from ddprt.transport.embree import Tracer
@@ -173,6 +173,90 @@ def test_a_sphere_lights_nothing_inside_itself() -> None:
     points = np.array([[0.3, 1.2, -0.4], [0.35, 1.2, -0.4], [0.3, 1.399, -0.4]])
     sample = light(RECORDS["sphere"]).illuminate(points, np.full((3, 2), 0.3))
     assert not sample.irradiance.any()
+
+
+# --- near rectangles --------------------------------------------------------------------------------------------------
+
+ENDS = {
+    "before the middle": ([-0.7, 0.5], [-0.2, 0.4], 0.3),
+    "aside": ([0.2, 1.5], [0.1, 0.9], 0.4),
+    "almost touched": ([-1.0, 1.0], [-0.5, 0.5], 0.01),
+    "long and thin": ([-4.0, 2.0], [0.3, 0.31], 0.2),
+    "edge on": ([0.5, 1.5], [0.5, 1.5], 1e-4),
+}
+
+
+@pytest.mark.parametrize("name", ENDS)
+def test_points_of_a_near_rectangle_fit_their_density(name: str) -> None:
+    """Shares of 12 x 12 cells against the solid angles of their spherical polygons: interior angles less those of the plane."""
+    x, y, z = np.array(ENDS[name][0]), np.array(ENDS[name][1]), ENDS[name][2]
+    at = sample_rectangle(x, y, z, np.random.default_rng(4).random((100_000, 2)))
+    edges = [np.linspace(*ends, 13) for ends in (x, y)]
+
+    def excess(x0: float, x1: float, y0: float, y1: float) -> mpmath.mpf:
+        corners = [mpmath.matrix(corner) for corner in ((x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z))]
+        total = mpmath.mpf(0)
+        for a, b, c in ((0, 1, 2), (0, 2, 3)):  # van Oosterom and Strackee 1983
+            p, q, r = corners[a], corners[b], corners[c]
+            lengths = [mpmath.norm(corner) for corner in (p, q, r)]
+            triple = mpmath.det(mpmath.matrix([list(p), list(q), list(r)]))
+            rest = (p.T * q)[0] * lengths[2] + (p.T * r)[0] * lengths[1] + (q.T * r)[0] * lengths[0]
+            total += 2 * mpmath.atan2(triple, lengths[0] * lengths[1] * lengths[2] + rest)
+        return total
+
+    with mpmath.workdps(40):
+        expected = np.array([
+            [float(excess(edges[0][i], edges[0][i + 1], edges[1][j], edges[1][j + 1])) for j in range(12)] for i in range(12)
+        ])  # fmt: skip
+        whole = float(excess(*x, *y))
+    assert expected.sum() == pytest.approx(whole, rel=1e-12)
+    assert chi_square(np.histogram2d(*at.T, edges)[0], expected) > 1e-4
+    # Arctangents are good to 1e-16 of a turn, whatever the solid angle.
+    assert _solid_angle(*x, *y, z) == pytest.approx(whole, abs=2e-15)
+    middle = np.array([[x.mean(), y.mean()]])
+    with mpmath.workdps(40):
+        tiny = 1e-6 * np.array([x[1] - x[0], y[1] - y[0]])
+        ((low, high),) = np.stack([middle - tiny / 2, middle + tiny / 2], 1)
+        share = float(excess(low[0], high[0], low[1], high[1])) / whole / tiny.prod()
+    np.testing.assert_allclose(pdf_rectangle(x, y, z, middle), share, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ENDS)
+def test_points_of_a_near_rectangle_there_and_back(name: str) -> None:
+    x, y, z = np.array(ENDS[name][0]), np.array(ENDS[name][1]), ENDS[name][2]
+    u = np.random.default_rng(5).uniform(0.01, 0.99, (1000, 2))
+    at = sample_rectangle(x, y, z, u)
+    assert ((at >= [x[0], y[0]]) & (at <= [x[1], y[1]])).all()
+    # Sines within z² of 1 are subtracted from each other on the way there: of 1e-16 each, that leaves 1e-16 / z².
+    np.testing.assert_allclose(invert_rectangle(x, y, z, at), u, rtol=0, atol=1e-12 + 1e-15 / z**2)
+
+
+@pytest.mark.parametrize("height", [0.02, 0.1, 0.4, 1.0, 3.0])
+def test_near_rectangles_are_quiet_and_meet_lamberts_formula(height: float) -> None:
+    """A sample of a near one brings radiance times solid angle times a cosine: its deviation is that of a cosine, at most 1."""
+    record = {"type": "rect", "center": [0.3, height, 0.1], "half_u": [1.0, 0, 0], "half_v": [0, 0, 0.6], "radiance": [2, 2, 2]}
+    corners = np.array([[0.3 + a, height, 0.1 + 0.6 * b] for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
+    expected = polygon_irradiance(corners, 2.0, np.zeros(3), UP)
+    mean, error = sampled(light(record), np.zeros(3), UP, 1 << 16)
+    assert abs(mean[0] - expected) < 4 * error[0]
+    assert (
+        256 * error[0] < 0.7 * expected
+    )  # a cosine's own deviation is 0.58 of its mean on a hemisphere of directions, 1 / sqrt(3)
+    turned = {**record, "half_u": [0, 0, 0.6], "half_v": [1.0, 0, 0]}
+    assert not sampled(light(turned), np.zeros(3), UP, 100)[0].any(), "its back is dark"
+
+
+def test_sides_of_near_and_far_give_the_same_light() -> None:
+    """Points about 1.5 half-diagonals away, some sampled by area and some by solid angle: all agree with the closed form."""
+    lamp = light(RECORDS["rect"], center=[0, 0, 0], half_u=[0.4, 0, 0], half_v=[0, 0, 0.3], radiance=[1, 1, 1])
+    corners = np.array([[0.4 * a, 0.0, 0.3 * b] for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
+    for distance in (0.74, 0.76):
+        point = distance * np.array([0.6, -0.64, 0.48])
+        mean, error = sampled(lamp, point, UP, 1 << 16)
+        assert abs(mean[0] - polygon_irradiance(corners, 1.0, point, UP)) < 4 * error[0]
+        sample = lamp.illuminate(np.tile(point, (9, 1)), np.random.default_rng(0).random((9, 2)))
+        assert (np.ptp(sample.strength) == 0) == (distance < 0.75)
+        np.testing.assert_allclose((point + sample.direction * sample.distance[:, None])[:, 1], 0, atol=1e-15)
 
 
 # --- slow twins -------------------------------------------------------------------------------------------------------

@@ -1,12 +1,13 @@
 """The planner against worlds whose laws are known: it finds what meets a budget, says what cannot be met, and is frugal."""
 
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
 import numpy as np
 import pytest
 
-from ddprt.bench.tune.planner import KNOBS, QUANTITIES, Law, Place, Plan, Planner, Trial
+from ddprt.bench.tune.planner import KNOBS, QUANTITIES, Guess, Law, Place, Plan, Planner, Trial
 
 BASE: Place = (256.0, 128.0, 0.01, 128.0)
 VALUES = ((64.0, 128.0, 181.0, 256.0), (16.0, 32.0, 64.0, 128.0, 256.0), (0.005, 0.01, 0.02, 0.04), (64.0, 128.0, 256.0))
@@ -26,6 +27,7 @@ def world(place: Place, rng: np.random.Generator | None = None) -> Trial:
         LADDER,
         tuple(float(np.hypot(rest, 0.3 * bases**-0.8)) for bases in LADDER),
         0.05,
+        0.0,
         tuple(20 + texels * bases * 1e-4 for bases in LADDER),
         {name: tuple(texels * bases * size / 1e6 for bases in LADDER) for name, size in (("half", 2), ("float", 4))},
         float(jitter * (1 + resolution**2 * (3 + 10 * lightings**0.6 * noise**-1.1))),
@@ -143,6 +145,54 @@ def test_where_all_else_is_barred_the_place_that_was_tried_is_the_answer() -> No
     still = Planner(BASE, [(value,) for value in BASE], BASES, ("half", "float"), planner.limits)
     still.add(world(BASE))
     assert still.next() == (plan, chance), "no knob can be turned"
+
+
+def test_a_chance_is_the_gaussian_one_without_skew_and_hall_s_with_it() -> None:
+    assert np.exp(Guess(0.0, 0.1).chance(np.exp(0.1))) == pytest.approx(0.8413447461, rel=1e-9)  # one standard deviation
+    for skew in (0.05, 0.3, 1.0, 3.0):
+        chances = [Guess(0.0, 0.1, skew).chance(float(np.exp(0.1 * t))) for t in np.linspace(-6, 6, 121)]
+        assert (np.diff(chances) >= 0).all(), "a wider limit is never less likely to be kept"
+        # The inverse of Hall's cubic, by its closed form, at the quantile of nine in ten.
+        x = -1.2815515655446004
+        t = 3 / skew * (np.cbrt(1 + skew * (x - skew / 6)) - 1)
+        assert np.exp(Guess(0.0, 0.1, skew).chance(float(np.exp(-0.1 * t)))) == pytest.approx(0.9, rel=1e-9)
+        assert -t > 1.2815515655446004, "farther than without skew"
+
+
+@pytest.mark.parametrize(("knob", "more"), [("atlas.resolution", False), ("points.count", True), ("lightings.train", False)])
+def test_what_cannot_be_baked_takes_along_what_cannot_for_the_same_reason(knob: str, more: bool) -> None:
+    planner = Planner(BASE, VALUES, BASES, ("half",), {"relative_rmse": 0.1})
+    place = (128.0, 32.0, 0.02, 128.0)
+    alike = {
+        other
+        for other in product(*VALUES)
+        if other == place
+        or (knob == "atlas.resolution" and other[0] == 128.0)
+        or (knob == "points.count" and other[0] == 128.0 and other[3] >= 128.0)
+    }
+    assert planner.bar(place, knob) == len(alike)
+    assert planner.barred == alike
+    assert planner.bar(place, knob) == 0, "told once"
+    planner.add(world(place))
+    assert place not in planner.barred, "it could be baked after all"
+    planner.bar((*place[:3], 64.0), knob)
+    assert place not in planner.barred, "what was tried is known"
+    assert ((*place[:3], 256.0) in alike) == (more or knob == "atlas.resolution")
+
+
+def test_only_an_error_that_is_not_known_well_may_be_decided_by_more_lightings() -> None:
+    def undecided(limits: dict[str, float], spread: float = 0.05) -> bool:
+        planner = Planner(BASE, VALUES, BASES, ("half",), limits)
+        planner.add(replace(world(BASE), error_spread=spread))
+        return planner.undecided(Plan(BASE, 128, "half"))
+
+    error = world(BASE).errors[-1]
+    for factor, wanted in ((0.89, False), (0.92, True), (1.08, True), (1.12, False)):
+        assert undecided({"relative_rmse": factor * error}) == wanted  # 0.05 times 2.05 is 0.103, both ways
+        assert not undecided({"relative_rmse": factor * error}, 0.03)
+    assert undecided({"megabytes": 1e3, "relative_rmse": error})
+    assert not undecided({"megabytes": 1e-3, "relative_rmse": error}), "it costs too much, whatever the error"
+    assert not undecided({"megabytes": 1e3})
 
 
 @pytest.mark.parametrize("far", [1e-2, 1e-6, 1e-300])

@@ -19,7 +19,7 @@ from ddprt.dataset.layers import Layer, read_layer, read_light
 from ddprt.dataset.manifest import Manifest, layer_name
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
-from ddprt.export.probes import export_probes
+from ddprt.export.layers import export_layers
 from ddprt.harmonics import clamped_cosine, harmonics
 from ddprt.lights import parse_lighting
 from ddprt.progress import Progress
@@ -369,7 +369,7 @@ def test_a_list_of_probes_is_no_grid() -> None:
 def test_the_documented_decoder_reproduces_probes(which: str, models: dict[str, Model], data: Dataset, tmp_path: Path) -> None:
     """Irradiance from the exported files alone, by the block that docs/effects.md prints, and the golden numbers."""
     model = models[which]
-    files = export_probes(model, tmp_path)
+    files = export_layers(model, tmp_path)
     assert [file.name for file in files] == ["probes.safetensors", "probes.json"]
     block = re.search(r"```python\n((?:(?!```).)*?def probes.*?)```", DOCS.read_text(), re.DOTALL)
     assert block
@@ -389,7 +389,7 @@ def test_the_documented_decoder_reproduces_probes(which: str, models: dict[str, 
     np.testing.assert_allclose(scope["probes"](tmp_path, ones, golden["normal"]), golden["irradiance"], atol=100 * EPS * size)
     assert told["grid"] == list(GRID)
     assert told["in_solids"] == np.flatnonzero(part.layer.weight == 0).tolist()
-    assert export_probes(replace(model, layers={}), tmp_path) == []
+    assert export_layers(replace(model, layers={}), tmp_path) == []
     assert not list(tmp_path.iterdir())
 
 

@@ -311,8 +311,8 @@ def test_page_is_whole_and_needs_nothing_else(page: str) -> None:
     assert all(target.startswith(("data:image/png;base64,", "#")) for target in found.targets)
     assert all(target[1:] in found.ids for target in found.targets if target.startswith("#"))
     assert not re.search(r"@import|url\((?!#)", page)
-    # Two lightings of ten pictures, four bases seen and flat, two pictures of points.
-    assert sum(target.startswith("data:") for target in found.targets) == 2 * 10 + 4 * 2 + 2
+    # Two lightings of ten pictures and two of three, four bases seen and flat, two pictures of points.
+    assert sum(target.startswith("data:") for target in found.targets) == 2 * 10 + 2 * 3 + 4 * 2 + 2
 
 
 def test_page_says_what_was_found(job: Job, page: str) -> None:

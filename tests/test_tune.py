@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,8 +16,9 @@ from ddprt.bench.measure import trial as trials
 from ddprt.bench.measure.settings import Setting, changed
 from ddprt.bench.measure.trial import Workshop
 from ddprt.bench.tune import search as tuning
-from ddprt.bench.tune.planner import KNOBS, QUANTITIES, Plan, Trial
-from ddprt.bench.tune.search import FACTORS, Outcome, Search, _around, first_bases, spread_of, told, tune, with_measured
+from ddprt.bench.tune.held_out import HeldOut, spread_of
+from ddprt.bench.tune.planner import KNOBS, QUANTITIES, Guess, Plan, Trial
+from ddprt.bench.tune.search import FACTORS, Outcome, Search, _around, first_bases, told, tune, with_measured
 from ddprt.config import Config, load_config
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
@@ -160,22 +162,28 @@ class Bench:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, works: Any = lambda place: True) -> None:
         self.asked: list[tuple[float, ...]] = []
+        self.reason = "points.count: got too many"
 
         def fake(search: Search, place: tuple[float, ...]) -> None:
             self.asked.append(place)
             if not works(place):
-                raise UserError("points.count: got too many")
+                raise UserError(self.reason)
             size = place[0] / search.base[0]
             error = 0.5 / size**0.3 * (search.base[1] / place[1]) ** 0.4
             curve = (error * 1.5, error)
             half = (size**2, 2 * size**2)
             search.planner.add(
-                Trial(place, (4, 16), curve, 0.05, (10.0, 20.0), {"half": half, "float": half}, 10 * size**1.5, 1.0)
+                Trial(place, (4, 16), curve, 0.05, 0.0, (10.0, 20.0), {"half": half, "float": half}, 10 * size**1.5, 1.0)
             )
 
         def verify(search: Search, plan: Plan) -> dict[str, float]:
             return {name: float(np.exp(guess.mean)) for name, guess in search.planner.guesses(plan).items()}
 
+        def found(held_out: HeldOut) -> int:
+            return 4
+
+        monkeypatch.setattr(HeldOut, "more", lambda *_: False)
+        monkeypatch.setattr(HeldOut, "count", property(found))
         monkeypatch.setattr(Search, "_try", fake)
         monkeypatch.setattr(Search, "_verify", verify)
 
@@ -185,14 +193,45 @@ def searching(tmp_path: Path, **changes: Any) -> Search:
     return Search(config, Workshop(config, tmp_path, QUIET))
 
 
-def test_places_that_cannot_be_baked_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_places_that_cannot_be_baked_are_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And those that cannot for the same reason with them, so that it is told once."""
     search = searching(tmp_path, tune__max_relative_rmse=0.42)
+    search.workshop = replace(search.workshop, progress=Progress())
     bench = Bench(monkeypatch, lambda place: place[3] <= 12)
     outcome = search.run()
     assert outcome.met
     assert len(bench.asked) == len(set(bench.asked)), "nothing is tried twice"
-    assert search.planner.barred == {place for place in bench.asked if place[3] > 12}
-    assert outcome.trials == len(bench.asked) - len(search.planner.barred)
+    failed = [place for place in bench.asked if place[3] > 12]
+    for later, place in enumerate(failed):
+        barred = any(place[0] == tried[0] and place[3] >= tried[3] for tried in failed[:later])
+        assert not barred, "as many points or more are not tried again at a resolution"
+    alike = {
+        place
+        for place in product(*search.planner.values)
+        if any(place[0] == tried[0] and place[3] >= tried[3] for tried in failed)
+    }
+    assert search.planner.barred == alike
+    assert outcome.trials == len(bench.asked) - len(failed)
+    assert capsys.readouterr().err.count("got too many") == len(failed)
+
+
+def test_a_resolution_that_cannot_be_unwrapped_does_not_end_the_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though more places have it than trials are allowed."""
+    search = searching(
+        tmp_path, tune__max_bake_seconds=0.95, tune__max_relative_rmse=5.0, atlas__resolution=128, tune__trials=4
+    )
+    monkeypatch.setattr(Search, "_start", lambda search: search.base)
+    bench = Bench(monkeypatch, lambda place: place[0] != 32)
+    bench.reason = "atlas.resolution: got 32, expected more"
+    every = [*product(*search.planner.values)]
+    search.bar(next(place for place in every if place[0] == 32), bench.reason)
+    assert search.planner.barred == {place for place in every if place[0] == 32}
+    assert len(search.planner.barred) > 4
+    outcome = search.run()
+    assert 1 < outcome.trials <= 4
+    assert not {place for place in bench.asked if place[0] == 32}
 
 
 def test_where_only_the_base_can_be_baked_it_is_the_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -361,40 +400,66 @@ def test_spread_agrees_with_a_bootstrap() -> None:
     error, mean = rng.lognormal(0, 0.5, count), rng.lognormal(0, 0.3, count)
     error *= mean**2  # brighter lightings err more, which a ratio partly takes out
     rows = rng.integers(0, count, (draws, count))
-    bootstrap = float(log_error(error[rows], mean[rows]).std())
+    logs = log_error(error[rows], mean[rows])
+    spread, skew = spread_of(tally(error, mean))
     # A standard deviation of 4000 draws is known to 1 / sqrt(8000) = 1.1 %, five of which are 5.6 %; the two differ by
     # sqrt(199 / 200) and terms of second order, of a share 1 / 200 each.
-    assert spread_of(tally(error, mean)) == pytest.approx(bootstrap, rel=0.056 + 0.0025 + 0.01)
+    assert spread == pytest.approx(float(logs.std()), rel=0.056 + 0.0025 + 0.01)
+    # The values that stand for the lightings, by the derivative of the logarithm, to terms of a share 1 / 200.
+    values = 0.5 * error / error.mean() - mean / mean.mean() + 0.5
+    assert skew == pytest.approx(np.mean(values**3) / np.mean(values**2) ** 1.5 / np.sqrt(count), rel=0.05)
+    assert skew > 0.05
 
 
 def test_spread_of_two_is_half_their_difference() -> None:
     error, mean = np.array([0.04, 0.25]), np.array([1.0, 2.0])
-    # Leaving one out leaves the other: logs a and b, sqrt(1/2 * 2 * ((a - b) / 2)²).
+    # Leaving one out leaves the other: logs a and b, sqrt(1/2 * 2 * ((a - b) / 2)²). Two lie evenly about their middle.
     first, second = log_error(error[:1], mean[:1]), log_error(error[1:], mean[1:])
-    assert spread_of(tally(error, mean)) == pytest.approx(abs(first - second) / 2, rel=1e-12)
+    assert spread_of(tally(error, mean)) == pytest.approx((abs(first - second) / 2, 0.0), rel=1e-12, abs=1e-12)
 
 
 def test_spread_knows_no_units_and_nothing_of_one_lighting() -> None:
     rng = np.random.default_rng(1)
     error, mean = rng.lognormal(size=9), rng.lognormal(size=9)
     assert spread_of(tally(error * 1e-20, mean * 1e9)) == pytest.approx(spread_of(tally(error, mean)), rel=1e-9)
-    assert spread_of(tally(np.ones(5), np.ones(5))) == pytest.approx(0, abs=1e-12)
-    assert spread_of(tally(error[:1], mean[:1])) == 1
-    assert spread_of(tally(np.zeros(5), np.ones(5))) == 1
+    assert spread_of(tally(np.ones(5), np.ones(5))) == pytest.approx((0, 0), abs=1e-12)
+    assert spread_of(tally(error[:1], mean[:1])) == (1, 0)
+    assert spread_of(tally(np.zeros(5), np.ones(5))) == (1, 0)
+
+
+@pytest.mark.parametrize("count", [32, 128])
+def test_a_sure_error_is_sure_although_few_lightings_make_most_of_it(count: int) -> None:
+    """Squared errors as a corridor has them: of a lognormal of spread 1.2, the largest hundredth makes a tenth of the mean."""
+    rng = np.random.default_rng(2)
+    whole, draws = float(log_error(rng.lognormal(0, 1.2, 10**6), np.ones(1))), 1500
+    sure = {"skewed": 0, "Gaussian": 0}
+    for _ in range(draws):
+        error = rng.lognormal(0, 1.2, count)
+        spread, skew = spread_of(tally(error, np.ones(count)))
+        for name, third in (("skewed", skew), ("Gaussian", 0.0)):
+            # The limit is the error of all; it is within it just so, which is to be believed in one case of ten.
+            chance = Guess(float(log_error(error, np.ones(1))), spread, third).chance(float(np.exp(whole)))
+            sure[name] += chance > np.log(0.9)
+    # Of 1500 draws a share of 0.1 is known to 0.0077, four of which are 0.031; what is left of the skew is of order 1 / count,
+    # whose factor grows with the fourth moment: it is not derived but bounded by half the error of the Gaussian beyond that.
+    wrong = {name: number / draws for name, number in sure.items()}
+    assert wrong["Gaussian"] > 0.1 + 0.031, "what this is about"
+    assert wrong["skewed"] < 0.1 + 0.031 + (wrong["Gaussian"] - 0.1) / 2
 
 
 def test_a_measurement_takes_its_place_on_the_curves() -> None:
     place = (32.0, 8.0, 0.01, 12.0)
     sizes = {"half": (1.0, 2.0, 4.0), "float": (2.0, 4.0, 8.0)}
-    known = Trial(place, (2, 4, 8), (0.3, 0.2, 0.1), 0.05, (10.0, 11.0, 12.0), sizes, 7.0, 3.0)
+    known = Trial(place, (2, 4, 8), (0.3, 0.2, 0.1), 0.05, 0.1, (10.0, 11.0, 12.0), sizes, 7.0, 3.0)
     reached = {"relative_rmse": 0.15, "frame_us": 20.0, "megabytes": 2.9, "bake_seconds": 99.0, "fit_seconds": 5.0}
-    between = with_measured(known, Plan(place, 6, "half"), reached, 0.5)
+    between = with_measured(known, Plan(place, 6, "half"), reached, 0.5, 0.2)
     assert between.bases == (2, 4, 6, 8)
     assert between.errors == (0.3, 0.2, 0.15, 0.1)
     assert between.frame_us == (10.0, 11.0, 20.0, 12.0)
     assert between.megabytes == {"half": (1.0, 2.0, 2.9, 4.0), "float": (2.0, 4.0, 6.0, 8.0)}
-    assert (between.error_spread, between.bake_seconds, between.fit_seconds) == (0.5, 7.0, 5.0)
-    there = with_measured(known, Plan(place, 4, "float"), reached, 0.5)
+    assert (between.error_spread, between.error_skew) == (0.5, 0.2)
+    assert (between.bake_seconds, between.fit_seconds) == (7.0, 5.0)
+    there = with_measured(known, Plan(place, 4, "float"), reached, 0.5, 0.2)
     assert there.bases == known.bases
     assert there.errors == (0.3, 0.15, 0.1)
     assert there.megabytes == {"half": (1.0, 2.0, 4.0), "float": (2.0, 2.9, 8.0)}

@@ -12,6 +12,8 @@ from the code. Nothing is a constant of some machine.
 | gather | a stretch for each thread (`transport/effort.py`) | rays; columns, past 512 lightings |
 | maps in the making | 32 MiB | bytes |
 | files of indirect light | two maps for each thread | files |
+| layers | their choice of rays; some places twice, and files as they come | places, columns |
+| light of what glows | its direct part on some texels, its bounces and choice of rays | samples |
 
 An EXR is compressed in blocks of 16 rows, each by itself. So maps need not be made whole to tell their size: some blocks get
 a few rays, are smoothed, and get the noise that is expected of them.
@@ -31,6 +33,7 @@ from ddprt.config import Config
 from ddprt.dataset import store
 from ddprt.dataset.denoise import find_denoiser
 from ddprt.dataset.forecast_indirect import expect_indirect
+from ddprt.dataset.forecast_layers import expect_constant, expect_layers
 from ddprt.dataset.generate import check_points, sunk
 from ddprt.dataset.manifest import Manifest, map_name
 from ddprt.dataset.sameness import baked_settings
@@ -165,18 +168,22 @@ def _foreseen(scene: Scene, config: Config, folder: Path, progress: Progress, be
     train, test = ([i for i, (name, _) in enumerate(entries) if (name == "test") is held] for held in (False, True))
     direct, seen, parts = _expect_direct(job, samples, train, test)
     stages.append(direct)
-    reading = _reading(job, seen)
+    reading, named = _reading(job, seen), 2 + len(ATLAS_FILES)
     for name, indices in (("train", train), ("test", test)):
-        expected, more = expect_indirect(job, name, indices, sorted({*seen} & {*indices}))
-        stages.append(expected)
-        parts += more
-    named = 2 + len(ATLAS_FILES)
+        some = sorted({*seen} & {*indices})
+        expected, more, sent = expect_indirect(job, name, indices, some)
+        layers, placed = expect_layers(job, name, indices, some, sent)
+        stages += [expected, *layers]
+        parts, between = parts + more, between + placed.seconds
+        named, described = named + placed.files, described + placed.bytes
+    stages += expect_constant(job)
     line = len(json.dumps({"file": map_name("indirect", 0), "bytes": 10**6, "sha256": "0" * 64})) + 1
     listing = line * (sum(stage.files for stage in stages) + named)
     between += placing + reading * len(entries)
     stages.append(Expected("files", between, 0, named + 2, described + listing))
     lamps = [sum(map(len, (lightings[index] for index in part))) for part in (train, test)]
-    held_out = stages[-2].seconds + reading * len(test) + direct.seconds * lamps[1] / sum(lamps)
+    tested = sum(stage.seconds for stage in stages if stage.name.endswith(" test"))
+    held_out = tested + reading * len(test) + direct.seconds * lamps[1] / sum(lamps)
     shorter = sorted((part for part in parts if part.then < part.seconds), key=lambda part: -part.seconds)
     return Forecast(tuple(stages), sum(stage.seconds for stage in stages) - held_out, job.peak, tuple(shorter), 0.0)
 

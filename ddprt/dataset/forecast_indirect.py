@@ -11,6 +11,7 @@ from ddprt import seeds
 from ddprt.axes import Float32, Int
 from ddprt.dataset.denoise import denoised
 from ddprt.dataset.manifest import map_name
+from ddprt.dataset.probes import Sent
 from ddprt.dataset.sampled import Expected, Number, Part, Sampled, extrapolated, on_a_line, scratched
 from ddprt.dataset.store import read_map, write_map
 from ddprt.lights import Lighting
@@ -35,16 +36,18 @@ class _Look:
       radiosity: of a few lightings.
       noise: relative RMSE that the maps will have.
       pooled: what the bake makes of training maps, if anything.
+      sent: light on the senders, as layers gather it, of most lightings.
     """
 
     operator: Any
     radiosity: Float32[np.ndarray, "senders columns"]
     noise: float
     pooled: Callable[[np.ndarray], np.ndarray] | None = None
+    sent: Sent | None = None
 
 
-def expect_indirect(job: Sampled, split: str, indices: list[int], seen: list[int]) -> tuple[Expected, list[Part]]:
-    """A stage of indirect light, and the parts of it that a setting could shorten.
+def expect_indirect(job: Sampled, split: str, indices: list[int], seen: list[int]) -> tuple[Expected, list[Part], Sent | None]:
+    """A stage of indirect light, the parts of it that a setting could shorten, and what layers are gathered from, if made.
 
     Args:
       job: the bake.
@@ -62,7 +65,8 @@ def expect_indirect(job: Sampled, split: str, indices: list[int], seen: list[int
     side = job.config.atlas.resolution
     if side >= 16:  # half of it must be a resolution too
         parts.append(Part(f"files of {_NAMES[split]} maps", storing, f"atlas.resolution = {side // 2}", storing / 4))
-    return Expected(f"indirect {split}", seconds + storing, rays, len(kinds) * len(indices), size), parts
+    sent = look.sent if look else None
+    return Expected(f"indirect {split}", seconds + storing, rays, len(kinds) * len(indices), size), parts, sent
 
 
 def _by_operator(job: Sampled, split: str, indices: list[int], seen: list[int], parts: list[Part]) -> tuple[float, int, _Look]:
@@ -87,7 +91,7 @@ def _by_operator(job: Sampled, split: str, indices: list[int], seen: list[int], 
     direct = np.concatenate([columns[place] for place in stand_ins], 1)
     lightings = [job.lightings[seen[place]] for place in stand_ins]
 
-    def costs(size: int) -> tuple[float, int, float, Any, Any]:
+    def costs(size: int) -> tuple[float, int, float, Any, Any, Any]:
         """Bounces and a choice of rays for so many lightings."""
         begun, before = time.perf_counter(), job.tracer.rays
         own = np.ascontiguousarray(direct[:, : 3 * size])
@@ -96,14 +100,14 @@ def _by_operator(job: Sampled, split: str, indices: list[int], seen: list[int], 
         near = operator.near(lightings[:size], own, bounces=job.bounces)
         begun = time.perf_counter()
         choice = choose_rays(operator, bounced.radiosity, config, near=near, held_out=test, seed=seed, stream=f"{split} 0")
-        return bouncing, traced, time.perf_counter() - begun, choice, bounced
+        return bouncing, traced, time.perf_counter() - begun, choice, bounced, near
 
     first_rays = job.tracer.rays - before
-    bouncing, traced, choosing, choice, bounced = costs(wide)
+    bouncing, traced, choosing, choice, bounced, near = costs(wide)
     rays = job.tracer.rays - before - first_rays + (halves - 1) * traced + choice.traced
     gathering = choice.seconds
     if count > wide:
-        half, _, _, fewer, _ = costs(wide // 2)
+        half, _, _, fewer, *_ = costs(wide // 2)
         bouncing = on_a_line((wide // 2, half), (wide, bouncing), count)
         gathering = on_a_line((wide // 2, fewer.seconds), (wide, gathering), count)
     again = 0.0
@@ -121,7 +125,8 @@ def _by_operator(job: Sampled, split: str, indices: list[int], seen: list[int], 
     writing = scratched(job.folder, maps, _SCRATCH, job.tracer.threads)
     few = np.linspace(0, wide - 1, min(wide, _LOOKED_AT)).astype(int)
     light = bounced.radiosity.reshape(operator.senders.count, -1, 3)[:, few].reshape(operator.senders.count, -1)
-    look = _Look(operator, np.ascontiguousarray(light), noise, choice.footprints.pooled if choice.footprints else None)
+    sent = Sent(operator, bounced, {"seed": seed, "stream": f"{split} 0", "near": near})
+    look = _Look(operator, np.ascontiguousarray(light), noise, choice.footprints.pooled if choice.footprints else None, sent)
     return making + averaging + halves * bouncing + choosing + again + gathering + writing, int(rays), look
 
 

@@ -6,7 +6,7 @@ coefficients are entries as texels are, so basis and transfer stay what they are
 of texels alone.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -65,8 +65,8 @@ def write_places(folder: Path, layer: Layer, manifest: Manifest) -> None:
     manifest.add(name)
 
 
-def write_light(folder: Path, layer: str, index: int, light: np.ndarray, manifest: Manifest, kind: str = "light") -> None:
-    """Coefficients of one lighting, (places, coefficients, 3) float32.
+def write_light(folder: Path, layer: str, index: int | str, light: np.ndarray, manifest: Manifest, kind: str = "light") -> None:
+    """Coefficients of one lighting, or of what no lighting changes ("constant"), (places, coefficients, 3) float32.
 
     Raises:
       UserError: not finite.
@@ -76,6 +76,25 @@ def write_light(folder: Path, layer: str, index: int, light: np.ndarray, manifes
         raise UserError(f"{name}: got light past the range of float32; lower the intensities or keep lamps off the surfaces")
     write_tensors(folder / name, {kind: light.astype(np.float32)})
     manifest.add(name)
+
+
+def write_halves(
+    folder: Path,
+    layer: str,
+    indices: Sequence[int],
+    halves: Callable[[int], Sequence[np.ndarray]],
+    manifest: Manifest,
+) -> None:
+    """Coefficients of lightings: what `halves` gives for one, or of two the mean as "light" and half the difference as "noise".
+
+    Raises:
+      UserError: not finite.
+    """
+    for index in indices:
+        parts = halves(index)
+        write_light(folder, layer, index, parts[0] if len(parts) == 1 else (parts[0] + parts[1]) / 2, manifest)
+        if len(parts) > 1:
+            write_light(folder, layer, index, (parts[0] - parts[1]) / 2, manifest, "noise")
 
 
 def read_layer(data: Dataset, name: str) -> Layer:
@@ -93,14 +112,15 @@ def read_layer(data: Dataset, name: str) -> Layer:
 
 
 def layers(data: Dataset) -> list[Layer]:
-    """All that a dataset has."""
-    return [read_layer(data, entry["name"]) for entry in data.description.get("layers", [])]
+    """All that a dataset has, but those without places: of gloss that nobody sees."""
+    found = [read_layer(data, entry["name"]) for entry in data.description.get("layers", [])]
+    return [layer for layer in found if len(layer.position)]
 
 
 def read_light(
-    data: Dataset, layer: Layer, indices: Sequence[int], kind: str = "light"
+    data: Dataset, layer: Layer, indices: Sequence[int | str], kind: str = "light"
 ) -> Float32[np.ndarray, "lightings places coefficients 3"]:
-    """Coefficients of lightings; kind is "light" or, of held-out lightings, "noise" (half the difference of two halves).
+    """Coefficients of lightings or of "constant"; kind is "light" or, of held-out ones, "noise" (half of what halves differ).
 
     Raises:
       UserError: a file that is not of this layer or holds what is not finite.
@@ -155,6 +175,12 @@ class LayerData(Dataset):
     def uv(self) -> None:
         """None."""
         return None
+
+    @cached_property
+    def constant(self) -> Float32[np.ndarray, "texels 3"] | None:
+        """Coefficients of emissive surfaces, in no other file of the layer; None where none were baked."""
+        entry = next(entry for entry in self.description["layers"] if entry["name"] == self._layer.name)
+        return read_light(self, self._layer, ["constant"])[0].reshape(-1, 3) if entry.get("constant") else None
 
     def maps(self, kind: str, indices: Sequence[int]) -> Float32[np.ndarray, "lightings texels 3"]:
         """Coefficients in place of texels; kind is "indirect" or "noise"."""

@@ -21,6 +21,11 @@ def layer_name(layer: str, index: int | str, kind: str = "light") -> str:
     return f"{layer}/{stem}.safetensors"
 
 
+def layer_lacks(manifest: "Manifest", layer: str, kinds: Sequence[str], indices: Iterable[int]) -> list[int]:
+    """The lightings that some kind of a layer's light is still missing of."""
+    return [index for index in indices if not all(manifest.holds(layer_name(layer, index, kind)) for kind in kinds)]
+
+
 class Manifest:
     """The list of whole files of a folder; appending is safe against being killed at any moment."""
 

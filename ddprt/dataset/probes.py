@@ -14,14 +14,14 @@ import numpy as np
 
 from ddprt.axes import Float32
 from ddprt.config import Config
-from ddprt.dataset.layers import Layer, read_layer, write_light, write_places
-from ddprt.dataset.manifest import Manifest, layer_name
+from ddprt.dataset.layers import Layer, read_layer, write_halves, write_light, write_places
+from ddprt.dataset.manifest import Manifest, layer_lacks, layer_name
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.progress import Progress
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
-from ddprt.transport.effects import Plan, probed
+from ddprt.transport.effects import Plan, plan, probed
 from ddprt.transport.embree import Tracer
 from ddprt.transport.glossiness import valid_integrator
 
@@ -63,7 +63,25 @@ def probe_layers(config: Config, scene: Scene) -> list[dict[str, Any]]:
     probes = import_module("ddprt.transport.probes")
     position = probes.places(config.probes, scene.bounds)
     places = {"count": len(position), "digest": probes.digest(position), "rays": config.probes.rays}
-    return [{"name": NAME, "quantity": "irradiance", "order": probes.ORDER, **places}]
+    glows = {"constant": True} if plan(scene, ()).called("emission") else {}
+    return [{"name": NAME, "quantity": "irradiance", "order": probes.ORDER, **places, **glows}]
+
+
+def placed_probes(module: ModuleType, config: Config, scene: Scene, tracer: Tracer, atlas: Atlas) -> Layer:
+    """Where probes stand, `module` being their file. Those not in free air count nothing, the others as much as the lightmap.
+
+    Raises:
+      UserError: none is in free air.
+    """
+    position = module.places(config.probes, scene.bounds)
+    valid = module.in_the_open(tracer, position)
+    if not valid.any():
+        raise UserError(
+            f"probes: got {len(position)}, none of them in free air, expected some; move the grid (probes.region_low and "
+            "region_high) or the positions of the file out of solids and walls"
+        )
+    weight = np.where(valid, atlas.area.sum() / valid.sum(), 0.0)
+    return Layer(NAME, "irradiance", module.ORDER, position, weight, np.full(len(position), -1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +107,6 @@ class ProbeBake:
     ) -> "ProbeBake | None":
         """Places probes, unless they are there; None where a plan does not call for any.
 
-        Probes that are not in free air count nothing, the others together as much as the lightmap.
-
         Raises:
           UserError: none is in free air.
         """
@@ -99,15 +115,7 @@ class ProbeBake:
             return None
         if manifest.holds(layer_name(NAME, "places")):
             return cls(module, read_layer(dataset, NAME), config, tracer, dataset, manifest)
-        position = module.places(config.probes, scene.bounds)
-        valid = module.in_the_open(tracer, position)
-        if not valid.any():
-            raise UserError(
-                f"probes: got {len(position)}, none of them in free air, expected some; move the grid (probes.region_low and "
-                "region_high) or the positions of the file out of solids and walls"
-            )
-        weight = np.where(valid, atlas.area.sum() / valid.sum(), 0.0)
-        layer = Layer(NAME, "irradiance", module.ORDER, position, weight, np.full(len(position), -1))
+        layer = placed_probes(module, config, scene, tracer, atlas)
         write_places(dataset.folder, layer, manifest)
         return cls(module, layer, config, tracer, dataset, manifest)
 
@@ -129,8 +137,7 @@ class ProbeBake:
           dark: no light leaves a surface, or none is to be followed.
         """
         kinds = ("light", "noise")[: 1 + (split == "test")]
-        names = {index: [layer_name(NAME, index, kind) for kind in kinds] for index in indices}
-        todo = [index for index in indices if not all(map(self.manifest.holds, names[index]))]
+        todo = layer_lacks(self.manifest, NAME, kinds, indices)
         if not todo:
             return
         valid = self.layer.weight > 0
@@ -146,13 +153,40 @@ class ProbeBake:
                         rays = self._rays(source, len(kinds), stage)
                         stage.pace(len(kinds) * rays * int(valid.sum()))
                     light[:, valid] = self._gathered(source, rays, stage)
-            for index in todo:
-                parts = [half[indices.index(index)] for half in halves]
-                both = [sum(parts) / len(parts), (parts[0] - parts[-1]) / 2]
-                for kind, values in zip(kinds, both, strict=False):
-                    write_light(self.dataset.folder, NAME, index, values, self.manifest, kind)
+            write_halves(
+                self.dataset.folder, NAME, todo, lambda index: [half[indices.index(index)] for half in halves], self.manifest
+            )
             stage.facts["rays"] = self.tracer.rays - before
         self._name_shut(progress)
+
+    def lacks_constant(self) -> bool:
+        """Whether the light of what glows is missing."""
+        return not self.manifest.holds(layer_name(NAME, "constant"))
+
+    def constant(self, irradiance: Float32[np.ndarray, "texels 3"], atlas: Atlas, scene: Scene, bounces: int) -> dict[str, Any]:
+        """Bakes the light of what glows, and tells how.
+
+        Args:
+          irradiance: of it, direct, on every texel.
+          atlas, scene, bounces: of the bake.
+        """
+        glow, emitters = (import_module(f"ddprt.transport.{name}") for name in ("emission_probes", "emission"))
+        valid, config = self.layer.weight > 0, self.config
+        found = glow.probe_light(
+            emitters.Emitters.of(scene),
+            self.tracer,
+            atlas,
+            irradiance,
+            self.layer.position[valid],
+            config.transport,
+            config.probes.rays,
+            seed=config.seed,
+            bounces=bounces,
+        )
+        light = np.zeros((len(valid), self.layer.coefficients, 3), np.float32)
+        light[valid] = found.light
+        write_light(self.dataset.folder, NAME, "constant", light, self.manifest)
+        return dict(found.facts)
 
     def _rays(self, source: Sent, halves: int, stage: Any) -> int:
         """Rays of each probe, as configured or as the noise that is aimed at asks."""

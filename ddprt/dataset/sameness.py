@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from ddprt.config import Config
-from ddprt.dataset import probes
+from ddprt.dataset.gloss import gloss_layers
+from ddprt.dataset.probes import probe_layers
 from ddprt.dataset.splits import SPLITS
 from ddprt.files import sha256
 from ddprt.lights import EnvironmentLight, Lighting
@@ -27,7 +28,7 @@ def baked_settings(config: Config, scene: Scene) -> dict[str, Any]:
         "seed": config.seed,
         "transport": transport | {"integrator": valid_integrator(transport["integrator"], scene)},
         "placing": config.points.model_dump(exclude={"quantity"}),
-        "layers": probes.probe_layers(config, scene),
+        "layers": probe_layers(config, scene) + gloss_layers(config, scene),
     }
 
 

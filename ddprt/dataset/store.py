@@ -242,8 +242,9 @@ def expected_files(description: dict[str, Any]) -> list[str]:
     for index, entry in enumerate(description["lightings"]):
         kinds = ["direct", "measured", "indirect", *(["noise"] if entry["split"] == "test" else [])]
         names += [map_name(kind, index) for kind in kinds]
-    for layer in (entry["name"] for entry in description.get("layers", [])):
-        names.append(layer_name(layer, "places"))
+    for part in description.get("layers", []):
+        layer = part["name"]
+        names += [layer_name(layer, "places"), *([layer_name(layer, "constant")] if part.get("constant") else [])]
         for index, entry in enumerate(description["lightings"]):
             names += [layer_name(layer, index, kind) for kind in ("light", "noise")[: 1 + (entry["split"] == "test")]]
     return names

@@ -1,11 +1,12 @@
 """Light from all around, as a picture of the sky."""
 
+from functools import lru_cache
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
-from ddprt.axes import Float
+from ddprt.axes import Float, Float64
 from ddprt.lights.light import Illumination, LightModel, Strength
 
 
@@ -62,3 +63,23 @@ class EnvironmentLight(LightModel):
     def scaled(self, factor: float) -> "EnvironmentLight":
         """See `Light`."""
         return self.model_copy(update={"scale": self.scale * factor})
+
+    def harmonics(self, order: int) -> Float64[np.ndarray, "harmonics 3"]:
+        """Coefficients of its radiance, W/m², by `ddprt.harmonics`: exact sums over the pixels.
+
+        Raises:
+          UserError: the image is missing, damaged, or no picture of light.
+        """
+        from ddprt import harmonics
+        from ddprt.lights.panorama import stamp
+
+        unturned = _projected(self.image, stamp(self.image), order)
+        return self.scale * harmonics.turned(unturned, np.deg2rad(self.rotation_deg))
+
+
+@lru_cache(32)  # 1024 x 512 pixels take 50 ms, which every turn of a sky would pay anew
+def _projected(image: str, stamp: tuple[int, ...], order: int) -> Float64[np.ndarray, "harmonics 3"]:
+    from ddprt import harmonics
+    from ddprt.lights.sky import load_sky
+
+    return harmonics.of_panorama(load_sky(image).radiance, order)

@@ -1,7 +1,8 @@
 """Classical precomputed radiance transfer: distant light as spherical harmonics, a matrix from them to every texel.
 
 A lighting is told by the coefficients of its radiance, L_k = integral of L Y_k, of one colour channel: E Y_k(-d) for parallel
-light of irradiance E that travels along d. Nothing is measured; the points only set the scale that all methods work in.
+light of irradiance E that travels along d, sums over its pixels for a sky. Nothing is measured; the points only set the scale
+that all methods work in.
 
 Sloan, Kautz and Snyder (2002) fill the matrix by projection: T_k = integral over the sphere of I(w) Y_k(w), where I(w) is the
 indirect light under unit light from w; by linearity that is the light under the harmonic Y_k as a lamp. Here it is the least
@@ -64,7 +65,7 @@ def describe(lightings: Sequence[Any], order: int) -> Float64[np.ndarray, "light
             else:
                 raise UserError(
                     f"sh-prt: got a light of type {light.kind}, which stands somewhere; expected distant light, as "
-                    'lightings.kinds = ["directional"] draws; take another method for lamps'
+                    'lightings.kinds = ["directional", "environment"] draws; take another method for lamps'
                 )
     return found
 

@@ -5,12 +5,14 @@ from typing import Any
 
 import numpy as np
 
+from ddprt import warp
 from ddprt.axes import Float32
-from ddprt.dataset.layers import QUANTITIES, LayerData
+from ddprt.dataset.layers import QUANTITIES, Layer, LayerData
 from ddprt.dataset.store import Dataset
 from ddprt.report.evaluate import projected
 from ddprt.runtime.model import LayerModel, Model
 
+_DIRECTIONS = 64  # that errors are looked at from
 Coefficients = Float32[np.ndarray, "lightings entries 3"]
 
 
@@ -22,6 +24,8 @@ def layer_scores(data: Dataset, model: Model) -> dict[str, Any]:
         channels, as a share of the mean irradiance; None where there is no light. noise_relative_rmse is the same of what the
         held-out light is uncertain by, projection_relative_rmse of what the best coefficients on the basis would leave. curve:
         the error of the first 1, 2, 4, ... bases alone, up to all. Where the method has no basis: no projection and no curve.
+        seen_relative_rmse, of radiance on surfaces: the same of what eyes see, values in 64 directions before each place's
+        surface, each weighed by its cosine as by its share of a picture; never below 0.
     """
     return {name: _scores(data, part) for name, part in model.layers.items()}
 
@@ -41,9 +45,14 @@ def _scores(data: Dataset, part: LayerModel) -> dict[str, Any]:
     lightings = [data.lightings[index] for index in test]
     found: dict[str, Any] = {
         "places": int((layer.weight > 0).sum()),
-        "relative_rmse": share(model.predict(values, lightings=lightings, clamp=False) - reference),
+        "relative_rmse": share(model.predict(values, lightings=lightings, clamp=False, constant=False) - reference),
         "noise_relative_rmse": share(own.maps("noise", test)),
     }
+    if layer.quantity == "radiance" and (layer.texel >= 0).all():
+        light = part.predict(values, lightings=lightings, constant=False)
+        found["seen_relative_rmse"] = _seen(
+            layer, light, reference.reshape(light.shape), data.gbuffer["geometric_normal"][layer.texel]
+        )
     basis = getattr(model.relighter, "basis", None)
     if basis is None or len(basis) == 0:
         return found
@@ -53,6 +62,18 @@ def _scores(data: Dataset, part: LayerModel) -> dict[str, Any]:
     found["curve"] = []
     for bases in sorted({*(2**power for power in range(len(basis).bit_length())), len(basis)}):
         shorter = replace(model, relighter=model.relighter.truncated(bases))  # type: ignore[attr-defined]
-        error = share(shorter.predict(values, clamp=False) - reference)
+        error = share(shorter.predict(values, clamp=False, constant=False) - reference)
         found["curve"].append({"bases": bases, "relative_rmse": error})
     return found
+
+
+def _seen(layer: Layer, ours: np.ndarray, reference: np.ndarray, normal: Float32[np.ndarray, "places 3"]) -> float | None:
+    """RMSE of what eyes see in directions that are spread evenly, over the mean of the reference; None where that is dark."""
+    square = total = whole = 0.0
+    for direction in warp.sample_sphere(warp.sobol(_DIRECTIONS, 2, seed=0)).astype(np.float64):
+        weight = layer.weight * np.maximum(normal @ direction, 0)
+        theirs = layer.towards(reference, direction)
+        square += float(np.einsum("lpc,p->", (layer.towards(ours, direction) - theirs) ** 2, weight, dtype=np.float64))
+        total += float(np.einsum("lpc,p->", theirs, weight, dtype=np.float64))
+        whole += theirs.size / len(weight) * float(weight.sum())
+    return float(np.sqrt(square / whole) / (total / whole)) if total > 0 else None

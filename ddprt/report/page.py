@@ -14,7 +14,9 @@ from ddprt.files import write_text
 from ddprt.methods.statuses import STATUSES
 from ddprt.report import figures, words
 from ddprt.report.evaluate import Evaluation
-from ddprt.report.view import View, default_camera, take_view
+from ddprt.report.lamps import on_picture
+from ddprt.report.shots import shots
+from ddprt.report.view import default_camera, take_view
 from ddprt.runtime.model import Model
 from ddprt.scene.mesh import Scene
 from ddprt.scene.unwrap import unwrap
@@ -196,12 +198,13 @@ def method_table(methods: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, li
 def _pictures(
     evaluation: Evaluation, data: Dataset, main: str, model: Model, config: Config, scene: Scene | None
 ) -> dict[str, Any]:
-    view, tracer = None, None
+    view, tracer, seen = None, None, []
     if scene is not None:
         atlas = data.description["atlas"]
         tracer = Tracer.of(scene, config.transport.threads)
         uv, _ = unwrap(scene, atlas["resolution"], atlas["padding"])
         view = take_view(tracer, uv, data.covered, default_camera(scene))
+        seen = shots(evaluation, data, main, model, scene, tracer, uv, config.report.views)
     truth, predicted, test = evaluation.truth, evaluation.predicted[main], data.split("test")
     errors, albedo, rows = truth.errors_per_lighting(predicted), data.gbuffer["albedo"], []
     for row, label in figures.choose_rows(errors, config.report.rows):
@@ -218,23 +221,14 @@ def _pictures(
             "mean": mean,
         }
         facts |= {"distance": distance if np.isfinite(distance) else None, "kinds": _kinds(data, test[row])}
-        rows.append({**pictures, **facts, "lamps": _lamps(view, lamps)})
+        rows.append({**pictures, **facts, "lamps": on_picture(view.camera, lamps) if view else []})
     basis = getattr(model.relighter, "basis", None)
     bases = [] if basis is None else figures.basis_pictures(np.asarray(basis), data.covered, view)
     points: tuple[bytes, ...] = ()
     if view is not None and tracer is not None:
         points = figures.points_pictures(data, model.points, tracer, view, truth.reference.mean(0))
     aspect = view.camera.aspect if view else 1.0
-    return {"rows": rows, "basis_pictures": bases, "points_pictures": points, "aspect": aspect}
-
-
-def _lamps(view: View | None, lamps: Sequence[np.ndarray | None]) -> list[tuple[float, float]]:
-    """Places of the lamps in the view's picture, percent from left and top."""
-    placed = [lamp for lamp in lamps if lamp is not None]
-    if view is None or not placed:
-        return []
-    places = view.camera.project(np.array(placed, np.float64))
-    return [(float(100 * x), float(100 * y)) for x, y in places if 0 <= x <= 1 and 0 <= y <= 1]
+    return {"rows": rows, "basis_pictures": bases, "points_pictures": points, "aspect": aspect, "shots": seen}
 
 
 def _kinds(data: Dataset, index: int) -> str:

@@ -6,6 +6,7 @@ from outside, through the walls that turn their backs.
 """
 
 import io
+import math
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -66,8 +67,8 @@ class Camera:
 
 _CORNELL = Camera((0.278, 0.273, -0.8), (0.278, 0.273, 0.0), 39.3, 1.0)  # as photographed in Cornell
 _STATUE = Camera((1.5, 1.9, 3.4), (0.0, 0.75, 0.0))
-_LION = Camera((1.5, 0.95, 1.25), (0.0, 0.36, 0.0))  # from its flank, which is what fills a picture
-_CAMERAS = {"cornell": _CORNELL, "cornell-hole": _CORNELL, "statue": _STATUE, "lion": _LION}
+_LION = Camera((1.72, 1.08, 1.43), (0.0, 0.42, 0.0))  # from its flank, which is what fills a picture
+_CAMERAS = {**dict.fromkeys(("cornell", "cornell-hole", "glossy-room"), _CORNELL), "statue": _STATUE, "lion": _LION}
 
 
 def default_camera(scene: Scene) -> Camera:
@@ -79,10 +80,49 @@ def default_camera(scene: Scene) -> Camera:
     showing = scene.geometric_normals @ away > 0
     corners = scene.corners[showing if showing.any() else slice(None)].reshape(-1, 3)
     target = (corners.min(0) + corners.max(0)) / 2
-    camera = Camera(_triple(target + away), _triple(target))
+    camera = Camera(triple(target + away), triple(target))
     across, depth = np.split((corners - target) @ camera.axes.T, [2], 1)
     distance = float((np.abs(across) / (0.92 * camera.reach) - depth).max())
-    return Camera(_triple(target + distance * away), _triple(target))
+    return Camera(triple(target + distance * away), triple(target))
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """The rays of a picture, some for each pixel, and the first front that each meets.
+
+    Attributes:
+      camera: whose they are.
+      shape: height and width of the picture in pixels.
+      directions: unit vectors, rows of the finer picture from the top.
+      pixel: row-major index of the pixel that each belongs to.
+      hits: what they meet; distances count from the last back that was passed.
+    """
+
+    camera: Camera
+    shape: tuple[int, int]
+    directions: Float32[np.ndarray, "rays 3"]
+    pixel: Int[np.ndarray, " rays"]
+    hits: Hits
+
+    @classmethod
+    def of(cls, tracer: Tracer, camera: Camera, height: int) -> "Rays":
+        """Traces those of a camera; the width follows from it."""
+        width = max(1, round(height * camera.aspect))
+        across, down = ((np.arange(count * _GRID) + 0.5) / (count * _GRID) for count in (width, height))
+        directions = camera.directions(np.stack(np.meshgrid(across, down), -1).reshape(-1, 2))
+        row, column = np.divmod(np.arange(len(directions)), width * _GRID)
+        hits = first_fronts(tracer, np.asarray(camera.eye), directions)
+        return cls(camera, (height, width), directions, row // _GRID * width + column // _GRID, hits)
+
+    def mean(self, values: Float[np.ndarray, "rays ..."]) -> np.ndarray:
+        """(height, width, ...): what pixels show of a value for each ray."""
+        height, width = self.shape
+        return values.reshape(height, _GRID, width, _GRID, *values.shape[1:]).mean((1, 3))
+
+    def weights(self, rays: Int[np.ndarray, " n"]) -> Float64[np.ndarray, "n 3"]:
+        """What each corner of the triangle that is met counts where some rays meet it."""
+        u, v = self.hits.u[rays], self.hits.v[rays]
+        return np.stack([1 - u - v, u, v], 1).astype(np.float64)
 
 
 @dataclass(frozen=True)
@@ -123,17 +163,11 @@ def take_view(
       camera: from where.
       height: pixels; the width follows from the camera.
     """
-    width = max(1, round(height * camera.aspect))
-    across, down = ((np.arange(count * _GRID) + 0.5) / (count * _GRID) for count in (width, height))
-    directions = camera.directions(np.stack(np.meshgrid(across, down), -1).reshape(-1, 2))
-    hits = first_fronts(tracer, np.asarray(camera.eye), directions)
-    hit = np.flatnonzero(hits.triangle >= 0)
-    row, column = np.divmod(hit, width * _GRID)
-    pixel = row // _GRID * width + column // _GRID
-    triangle, weights = hits.triangle[hit], np.stack([1 - hits.u[hit] - hits.v[hit], hits.u[hit], hits.v[hit]], 1)
-    place, share = np.einsum("nc,ncd->nd", weights, uv[triangle]), 1 / _GRID**2
-    lookup = look_up(place, pixel, np.full(len(hit), share), height * width, covered)
-    return View(camera, lookup, (share * np.bincount(pixel, minlength=height * width)).reshape(height, width))
+    rays = Rays.of(tracer, camera, height)
+    hit = np.flatnonzero(rays.hits.triangle >= 0)
+    place, share = np.einsum("nc,ncd->nd", rays.weights(hit), uv[rays.hits.triangle[hit]]), 1 / _GRID**2
+    lookup = look_up(place, rays.pixel[hit], np.full(len(hit), share), math.prod(rays.shape), covered)
+    return View(camera, lookup, rays.mean((rays.hits.triangle >= 0).astype(np.float64)))
 
 
 def look_up(
@@ -155,6 +189,14 @@ def look_up(
     texels, weights = _bilinear(place, covered)
     entries = (share[:, None] * weights).ravel(), (np.repeat(row, 4), texels.ravel())
     return csr_matrix(entries, (rows, int(covered.sum())))
+
+
+def nearest_texels(place: Float64[np.ndarray, "n 2"], covered: Bool[np.ndarray, "height width"]) -> Int[np.ndarray, " n"]:
+    """The covered texel that each place of the lightmap lies in, or the nearest one."""
+    slot = np.cumsum(covered).reshape(covered.shape) - 1
+    near = distance_transform_edt(~covered, return_distances=False, return_indices=True)
+    column, row = np.clip((place * covered.shape[::-1]).astype(int), 0, np.array(covered.shape[::-1]) - 1).T
+    return slot[near[0, row, column], near[1, row, column]]
 
 
 def first_fronts(tracer: Tracer, eye: Float64[np.ndarray, "3"], directions: Float32[np.ndarray, "rays 3"]) -> Hits:
@@ -249,6 +291,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def _triple(vector: np.ndarray) -> tuple[float, float, float]:
+def triple(vector: np.ndarray) -> tuple[float, float, float]:
+    """A vector as a camera has it."""
     x, y, z = vector.tolist()
     return x, y, z

@@ -250,22 +250,23 @@ class LayerModel:
     layer: Layer
     model: Model
 
-    def predict(self, values: Any, *, lightings: Any = None) -> np.ndarray:
-        """Harmonics from measured light.
+    def predict(self, values: Any, *, lightings: Any = None, constant: bool = True) -> np.ndarray:
+        """Harmonics from measured light, and the light of what glows.
 
         Args:
-          values, lightings: as for `Model.predict`.
+          values, lightings, constant: as for `Model.predict`.
         Returns:
           (places, coefficients, 3) or (frames, places, coefficients, 3) float32, in the layer's quantity.
         Raises:
           UserError: likewise.
         """
-        light = self.model.predict(values, lightings=lightings, clamp=False)
+        light = self.model.predict(values, lightings=lightings, clamp=False, constant=constant)
         return light.reshape(*light.shape[:-2], *self.model.covered.shape, 3)
 
-    def towards(self, values: Any, directions: Any, *, lightings: Any = None) -> np.ndarray:
+    def towards(self, values: Any, directions: Any, *, lightings: Any = None, constant: bool = True) -> np.ndarray:
         """Values of the functions in a direction (3,), or in one for each place (places, 3); never below 0."""
-        return self.layer.towards(self.predict(values, lightings=lightings), np.asarray(directions, np.float64))
+        light = self.predict(values, lightings=lightings, constant=constant)
+        return self.layer.towards(light, np.asarray(directions, np.float64))
 
 
 def _real(values: Any) -> np.ndarray:

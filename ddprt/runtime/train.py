@@ -133,7 +133,7 @@ def fit_method(
         yardstick,
         {} if isinstance(data, LayerData) else {layer.name: of_layer(layer) for layer in layers(data)},
         None if isinstance(data, LayerData) else data.holes,
-        None if isinstance(data, LayerData) else data.constant,
+        data.constant,
     )
 
 

@@ -143,9 +143,7 @@ def mean_irradiance(
     total = np.zeros((places.count, 3), np.float32)
     for light in lighting:
         words = rng.integers(0, 1 << 64, 0 if light.delta else places.count, np.uint64).view(np.uint32).reshape(-1, 2)
-        around = light.anchor() is None and not light.delta
-        sequence = (_lattice if around else _sequence)(places.samples)
-        _add(tracer, light, places, partial(_shifted, words, sequence), total, shadows)
+        _add(tracer, light, places, partial(_shifted, words, _lattice(places.samples)), total, shadows)
     return total
 
 
@@ -209,16 +207,18 @@ def _given(numbers: Float32[np.ndarray, "n 2"], first: int, u: Float32[np.ndarra
 
 
 def _sequence(samples: int) -> Float32[np.ndarray, "2 samples"]:
-    """Points spread over the unit square: x -> x + (1 / rho, 1 / rho²) modulo 1 with rho³ = rho + 1.
+    """Places spread over the unit square: x -> x + (root of 2, root of 3) modulo 1.
 
-    Reference: Roberts, "The Unreasonable Effectiveness of Quasirandom Sequences", 2018.
+    No whole multiples of these two and of the golden ratio add up to a whole number, so that a texel's places and the parts
+    of a light that they meet (`_lattice`) are spread over all four dimensions. By one sequence both would move in step.
+
+    Reference: Niederreiter, "Random Number Generation and Quasi-Monte Carlo Methods", 1992, 5.
     """
-    rho = 1.32471795724474602596
-    return np.minimum(np.arange(samples) / np.array([[rho], [rho**2]]) % 1, 1 - 2**-24).astype(np.float32)
+    return np.minimum(np.arange(samples) * np.sqrt([[2.0], [3.0]]) % 1, 1 - 2**-24).astype(np.float32)
 
 
 def _lattice(samples: int) -> Float32[np.ndarray, "2 samples"]:
-    """The same for light from all around, of which every sample counts: even steps, and turns by the golden ratio.
+    """Parts of a light, spread over the unit square: even steps, and turns by the golden ratio.
 
     Even steps put as many samples of each group below a half as above it, where a sky divides its techniques.
     """

@@ -3,12 +3,15 @@
 Its direct part is looked for from both sides, since neither does alone. A point of the emitters, chosen by their power, finds
 small and far ones; a ray of the hemisphere finds those that a surface touches, where 1 / r² has no bound. Their densities
 weigh them (balance heuristic), so no sample is worth more than pi times the radiance. What bounces is the operator's, from
-senders as small as texels, which for a single lighting costs little.
+senders as small as texels, which for a single lighting costs little. Where surfaces gloss it comes by paths: at each of their
+vertices emitters are looked for in the same way, at glossy ones with a ray of the lobe in place of one of the hemisphere.
 
 Reference: Veach and Guibas, "Optimally Combining Sampling Techniques for Monte Carlo Rendering", SIGGRAPH 1995.
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,8 +26,9 @@ from ddprt.scene.mesh import Scene
 from ddprt.sections import TransportConfig
 from ddprt.transport.direct import Places
 from ddprt.transport.embree import Tracer, lifted
+from ddprt.transport.glossiness import glossy
 
-_FEW, _MOST = 16, 4096  # samples of each texel and half that tell the noise, and that are taken unasked
+FEW, MOST = 16, 4096  # samples of each texel and half that tell the noise, and that are taken unasked
 _BATCH = 1 << 15  # samples that go through together
 _LOOKED_UP = 64  # places of a textured triangle that tell its power
 _FAINTEST = 1 / 64  # of the power that the brightest of its texels would give it: what lies between those places
@@ -99,7 +103,8 @@ class Emitters:
         tracer: Tracer,
         origins: Float32[np.ndarray, "n 3"],
         normals: Float32[np.ndarray, "n 3"],
-        u: Float32[np.ndarray, "n 4"],
+        u: Float32[np.ndarray, "n numbers"],
+        lobes: Any = None,
     ) -> Float64[np.ndarray, "n 3"]:
         """One sample of their direct irradiance from either side, W/m²; its mean over `u` is exact.
 
@@ -107,11 +112,19 @@ class Emitters:
           tracer: the occluders, which the emitters are among.
           origins: of rays, off the surface (see `lifted`), centred frame, metres.
           normals: unit, geometric.
-          u: uniform numbers.
+          u: uniform numbers, 4 of each; 5 where there are lobes.
+          lobes: the `ddprt.transport.gloss.Lobes` of glossy surfaces; then it is pi times the radiance that they send out.
         """
         light = np.zeros((len(origins), 3))
-        self._chosen_points(tracer, origins, normals, u[:, :2], light)
-        self._chosen_directions(tracer, origins, normals, u[:, 2:], light)
+        directions = lobes.scattered(u[:, 2:])[0] if lobes else warp.to_world(warp.sample_cosine(u[:, 2:]), warp.frame(normals))
+        for found in (self.at_points(tracer, origins, u[:, :2], normals), self.along(tracer, origins, directions)):
+            if lobes:
+                some = lobes.part(found.which)
+                worth, density = np.pi * some.reflected(found.towards), some.density(found.towards)
+            else:
+                cosine = found.cosine(normals)
+                worth, density = np.maximum(cosine, 0)[:, None], np.maximum(cosine, 1e-300) / np.pi
+            light[found.which] += found.balanced(worth, density)
         return light
 
     def shine(
@@ -122,40 +135,81 @@ class Emitters:
         origins, normals = np.ascontiguousarray(rows[:, :3]), np.ascontiguousarray(rows[:, 3:])
         return self.irradiance(tracer, origins, normals, rng.random((len(rows), 4), np.float32)).astype(np.float32)
 
-    def _chosen_points(
-        self, tracer: Tracer, origins: np.ndarray, normals: np.ndarray, u: np.ndarray, light: Float64[np.ndarray, "n 3"]
-    ) -> None:
-        """Adds what comes from points of the emitters, one for each origin."""
+    def at_points(
+        self,
+        tracer: Tracer,
+        origins: Float32[np.ndarray, "n 3"],
+        u: Float32[np.ndarray, "n 2"],
+        normals: Float32[np.ndarray, "n 3"] | None = None,
+    ) -> "Found":
+        """A point of theirs for each origin, where it is seen from there; with normals, in front of these alone."""
         index, weights = sample_triangles(self.cumulative, u)
         triangle = self.triangle[index]
         a, b, c = np.moveaxis(self.corners[index], 1, 0)
         point = a + weights[:, :1] * (b - a) + weights[:, 1:] * (c - a)
         facing = self.scene.geometric_normals[triangle]
-        squared, cosine, their_cosine = _facing(origins, normals, point, facing)
-        seen = np.flatnonzero((cosine > 0) & (their_cosine > 0))
+        away = point - origins
+        there = np.einsum("nd,nd->n", away, facing) < 0
+        if normals is not None:
+            there &= np.einsum("nd,nd->n", away, normals) > 0
+        seen = np.flatnonzero(there)
         # The ray ends as far off the emitter as it starts off the receiver, however flat it meets either.
         way = (point + tracer.offset * facing - origins)[seen]
         length = np.linalg.norm(way, axis=1)
         reach = np.maximum(length - tracer.offset / 2, 0).astype(np.float32)
         towards = np.ascontiguousarray(way / np.maximum(length, 1e-300)[:, None], np.float32)
-        seen = seen[tracer.unoccluded(np.ascontiguousarray(origins[seen]), towards, reach) != 0]
-        weight = _balanced(cosine[seen], their_cosine[seen], squared[seen], self.density[triangle[seen]])
-        light[seen] += weight[:, None] * self.radiance(triangle[seen], weights[seen].astype(np.float64))
+        free = tracer.unoccluded(np.ascontiguousarray(origins[seen]), towards, reach) != 0
+        seen = seen[free]
+        return self._found(seen, towards[free], away[seen], triangle[seen], weights[seen].astype(np.float64))
 
-    def _chosen_directions(
-        self, tracer: Tracer, origins: np.ndarray, normals: np.ndarray, u: np.ndarray, light: Float64[np.ndarray, "n 3"]
-    ) -> None:
-        """Adds what comes along cosine-weighted directions, one for each origin."""
-        directions = warp.to_world(warp.sample_cosine(u), warp.frame(normals))
+    def along(self, tracer: Tracer, origins: Float32[np.ndarray, "n 3"], directions: Float32[np.ndarray, "n 3"]) -> "Found":
+        """Where rays meet them."""
         hits = tracer.closest(origins, directions)
         met = np.flatnonzero(hits.front & (self.density[hits.triangle] > 0))
         there = hits.triangle[met]
         weights = np.stack([hits.u[met], hits.v[met]], 1).astype(np.float64)
         a, b, c = np.moveaxis(self.scene.corners[there] - self.scene.centre, 1, 0)
         point = a + weights[:, :1] * (b - a) + weights[:, 1:] * (c - a)
-        squared, cosine, their_cosine = _facing(origins[met], normals[met], point, self.scene.geometric_normals[there])
-        weight = _balanced(cosine, their_cosine, squared, self.density[there])
-        light[met] += weight[:, None] * self.radiance(there, weights)
+        return self._found(met, directions[met], point - origins[met], there, weights)
+
+    def _found(
+        self, which: np.ndarray, towards: np.ndarray, away: np.ndarray, triangle: np.ndarray, weights: np.ndarray
+    ) -> "Found":
+        squared = np.maximum(np.einsum("nd,nd->n", away, away), 1e-300)
+        facing = -np.einsum("nd,nd->n", away, self.scene.geometric_normals[triangle]) / np.sqrt(squared)
+        by_point = self.density[triangle] * squared / np.where(facing > 0, facing, 1)
+        light = np.where(facing[:, None] > 0, self.radiance(triangle, weights), 0.0)
+        return Found(which, towards, away, light, by_point)
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What some rays found of the emitters.
+
+    Attributes:
+      which: of the rays.
+      towards: unit directions, world.
+      away: from their origins to the emitters, metres.
+      radiance: that comes from there, W/(m² sr).
+      by_point: density of `at_points` there, per steradian.
+    """
+
+    which: Int[np.ndarray, " n"]
+    towards: Float32[np.ndarray, "n 3"]
+    away: Float64[np.ndarray, "n 3"]
+    radiance: Float64[np.ndarray, "n 3"]
+    by_point: Float64[np.ndarray, " n"]
+
+    def cosine(self, normals: Float32[np.ndarray, "rays 3"]) -> Float64[np.ndarray, " n"]:
+        """Between the directions and normals at the origins of all rays."""
+        squared = np.maximum(np.einsum("nd,nd->n", self.away, self.away), 1e-300)
+        return np.einsum("nd,nd->n", self.away, normals[self.which]) * (1 / np.sqrt(squared))
+
+    def balanced(
+        self, worth: Float[np.ndarray, "n channels"], density: Float[np.ndarray, " n"] | float
+    ) -> Float64[np.ndarray, "n 3"]:
+        """Worth times radiance over the densities of both sides, per steradian: `density` is that of the directions."""
+        return worth / np.maximum(self.by_point + density, 1e-300)[:, None] * self.radiance
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,12 +219,14 @@ class Constant:
     Attributes:
       irradiance: W/m², the mean of two halves.
       noise: half their difference, W/m².
+      direct: of the first, what comes straight from the emitters.
       facts: samples and rays of each texel, and the noise that they left.
       relative: noise over light, both RMS over the surface.
     """
 
     irradiance: Float32[np.ndarray, "texels 3"]
     noise: Float32[np.ndarray, "texels 3"]
+    direct: Float32[np.ndarray, "texels 3"]
     facts: dict[str, Any]
     relative: float
 
@@ -189,35 +245,51 @@ def constant_light(
     emitters = Emitters.of(scene)
     if len(emitters.triangle) == 0:
         dark = np.zeros((atlas.count, 3), np.float32)
-        return Constant(dark, dark, {"emitters": 0}, 0.0)
-    samples = _FEW if config.test_samples == "auto" else max(1, config.test_samples // 2)
-    direct = [_direct(emitters, tracer, atlas, samples, seed, half) for half in range(2)]
+        return Constant(dark, dark, dark, {"emitters": 0}, 0.0)
+    samples = FEW if config.test_samples == "auto" else max(1, config.test_samples // 2)
+    direct = [straight(emitters, tracer, atlas, samples, seed, half) for half in range(2)]
     if config.test_samples == "auto":
-        wanted = int(min(_MOST, np.ceil(_FEW * (_relative(direct, atlas) / config.target_noise) ** 2)))
+        wanted = wanted_samples(direct, atlas.area, config.target_noise)
         if wanted > samples:
             samples = wanted
-            direct = [_direct(emitters, tracer, atlas, samples, seed, half) for half in range(2)]
+            direct = [straight(emitters, tracer, atlas, samples, seed, half) for half in range(2)]
     facts: dict[str, Any] = {"emitters": len(emitters.triangle), "direct_samples": 2 * samples}
     halves = direct
     if bounces != 0:
-        indirect, rays = _indirect(emitters, tracer, atlas, direct, config, seed, bounces)
+        if any(glossy(scene)):
+            indirect, rays = _by_paths(emitters, tracer, atlas, config, seed, bounces)
+        else:
+            indirect, rays = _by_operator(emitters, tracer, atlas, direct, config, seed, bounces)
         facts["samples"] = rays
         halves = [one + other for one, other in zip(direct, indirect, strict=True)]
-    relative = _relative(halves, atlas)
+    relative = _relative(halves, atlas.area)
     facts["noise"] = float(f"{relative:.3g}")
     irradiance, noise = (halves[0] + halves[1]) / 2, (halves[0] - halves[1]) / 2
-    return Constant(irradiance, noise, facts, relative)
+    return Constant(irradiance, noise, (direct[0] + direct[1]) / 2, facts, relative)
 
 
-def _direct(
-    emitters: Emitters, tracer: Tracer, atlas: Atlas, samples: int, seed: int, half: int
+def wanted_samples(
+    halves: Sequence[Float32[np.ndarray, "texels 3"]], area: Float64[np.ndarray, " texels"], target: float
+) -> int:
+    """Samples of each texel and half that a noise takes, from two halves of `FEW`."""
+    return int(min(MOST, np.ceil(FEW * (_relative(halves, area) / target) ** 2)))
+
+
+def straight(
+    emitters: Emitters,
+    tracer: Tracer,
+    atlas: Atlas,
+    samples: int,
+    seed: int,
+    half: int,
+    chosen: Int[np.ndarray, " texels"] | None = None,
 ) -> Float32[np.ndarray, "texels 3"]:
-    """Mean direct irradiance of each texel: places, points and directions from one sequence, shifted for each texel."""
+    """Mean direct irradiance of texels: places, points and directions from one sequence, shifted for each texel."""
     sequence = warp.sobol(samples, 6, seeds.number(seed, "emission", half, samples))
-    block = max(1, _BATCH // samples)
+    block, wanted = max(1, _BATCH // samples), np.arange(atlas.count) if chosen is None else chosen
 
     def work(first: int) -> Float32[np.ndarray, "some 3"]:
-        texels = np.arange(first, min(first + block, atlas.count))
+        texels = wanted[first : first + block]
         shift = seeds.stream(seed, "emission", half, samples, first).random((len(texels), 1, 6), np.float32)
         u = (shift + sequence).reshape(-1, 6)
         u -= u >= 1
@@ -226,10 +298,10 @@ def _direct(
         light = emitters.irradiance(tracer, lifted(tracer, positions, normals), normals, u[:, 2:])
         return light.reshape(len(texels), samples, 3).mean(1).astype(np.float32)
 
-    return np.concatenate(list(tracer.map(work, range(0, atlas.count, block))))
+    return np.concatenate(list(tracer.map(work, range(0, len(wanted), block))))
 
 
-def _indirect(
+def _by_operator(
     emitters: Emitters,
     tracer: Tracer,
     atlas: Atlas,
@@ -258,30 +330,42 @@ def _indirect(
     return found, float(2 * np.mean(rays))
 
 
-def _facing(
-    origins: np.ndarray, normals: np.ndarray, points: np.ndarray, facing: np.ndarray
-) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-    """Squared distances of pairs, and the cosines at both ends; the second ends must not touch the first."""
-    away = points - origins
-    squared = np.maximum(np.einsum("nd,nd->n", away, away), 1e-300)
-    inverse = 1 / np.sqrt(squared)
-    return squared, np.einsum("nd,nd->n", away, normals) * inverse, -np.einsum("nd,nd->n", away, facing) * inverse
+def along_paths(
+    emitters: Emitters, tracer: Tracer, atlas: Atlas, out: Float32[np.ndarray, "lightings texels 3"], **settings: Any
+) -> Iterator[int]:
+    """Their mean indirect irradiance on texels, tile by tile; settings as of `ddprt.transport.paths.follow`."""
+    from ddprt.transport.paths import follow
+
+    def shading(met: Any, rng: np.random.Generator, sums: Float64[np.ndarray, "lightings receivers 3"]) -> None:
+        lobes = getattr(met, "lobes", None)
+        there, u = met.there if lobes else met, rng.random((len(met.owner), 4 + bool(lobes)), np.float32)
+        origins, normals = (np.ascontiguousarray(part.T) for part in (met.place[:3], met.place[3:]))
+        light = emitters.irradiance(tracer, origins, normals, u, lobes) * there.throughput.T
+        for channel in range(3):
+            sums[0, :, channel] += np.bincount(met.owner, light[:, channel], minlength=sums.shape[1])
+
+    return follow(tracer, emitters.scene, atlas, shading, out, **settings)
 
 
-def _balanced(
-    cosine: Float64[np.ndarray, " n"],
-    their_cosine: Float64[np.ndarray, " n"],
-    squared: Float64[np.ndarray, " n"],
-    density: Float64[np.ndarray, " n"],
-) -> Float64[np.ndarray, " n"]:
-    """cosine / (density of points + density of directions, both per steradian); nothing where a side is not met."""
-    towards = their_cosine > 0
-    by_point = density * squared / np.where(towards, their_cosine, 1)
-    return np.where(towards & (cosine > 0), cosine / (by_point + np.maximum(cosine, 1e-300) / np.pi), 0.0)
+def _by_paths(
+    emitters: Emitters, tracer: Tracer, atlas: Atlas, config: TransportConfig, seed: int, bounces: int
+) -> tuple[list[Float32[np.ndarray, "texels 3"]], float]:
+    """The same without lookups, which glossy surfaces do not allow: two halves, and paths of both per texel."""
+    from ddprt.transport.paths import samples_for
+
+    tracing, address = partial(along_paths, emitters, tracer, atlas), {"seed": seed, "bounces": bounces}
+    samples = config.test_samples
+    if samples == "auto":
+        samples, _ = samples_for(tracing, atlas, 1, target=config.target_noise, stream="emission", **address)
+    each, halves = max(1, samples // 2), np.zeros((2, 1, atlas.count, 3), np.float32)
+    for half, out in enumerate(halves):
+        for _ in tracing(out, samples=each, stream=f"emission {half}", **address):
+            pass
+    return [half[0] for half in halves], float(2 * each)
 
 
-def _relative(halves: list[Float32[np.ndarray, "texels 3"]], atlas: Atlas) -> float:
+def _relative(halves: Sequence[Float32[np.ndarray, "texels 3"]], area: Float64[np.ndarray, " texels"]) -> float:
     """RMS of half the difference over that of the mean, over the surface."""
     one, other = (half.astype(np.float64) for half in halves)
-    noise, light = (np.einsum("t,tc->", atlas.area, part**2) for part in (one - other, one + other))
+    noise, light = (np.einsum("t,tc->", area, part**2) for part in (one - other, one + other))
     return float(np.sqrt(noise / light)) if light > 0 else 0.0

@@ -19,7 +19,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ddprt.axes import Float, Float32, Float64
+from ddprt.axes import Float, Float32, Float64, Int
 from ddprt.compiled import compiled
 
 SMOOTHEST = 0.05
@@ -43,7 +43,7 @@ def evaluate(outgoing: Directions, incoming: Directions, base: Directions, gloss
       gloss: roughness, metallic and the dielectric's reflectance, each 0 to 1.
     """
     value = np.empty((len(outgoing), 3), np.float32)
-    _evaluate(outgoing, incoming, base, gloss, *_tables(), value)
+    _evaluate(outgoing, incoming, base, gloss, *tables(), value)
     return value
 
 
@@ -56,15 +56,37 @@ def sample(
       The directions, and `evaluate` over `pdf` there: 0 where a facet reflects below the surface.
     """
     incoming, weight = np.empty((2, len(outgoing), 3), np.float32)
-    _sample(outgoing, u, base, gloss, *_tables(), incoming, weight)
+    _sample(outgoing, u, base, gloss, *tables(), incoming, weight)
     return incoming, weight
 
 
 def pdf(outgoing: Directions, incoming: Directions, base: Directions, gloss: Directions) -> Float32[np.ndarray, " n"]:
     """Density of `sample`, per steradian; its integral over the hemisphere is the share of samples that stay above it."""
     density = np.empty(len(outgoing), np.float32)
-    _pdf(outgoing, incoming, base, gloss, *_tables(), density)
+    _pdf(outgoing, incoming, base, gloss, *tables(), density)
     return density
+
+
+def shared(
+    incoming: Directions,
+    base: Directions,
+    gloss: Directions,
+    group: Int[np.ndarray, "n 2"],
+    outgoing: Float[np.ndarray, "all 3"],
+    factor: Float[np.ndarray, "all factors"],
+) -> Float32[np.ndarray, "n factors 3"]:
+    """What light from each incoming direction is worth to sums over outgoing ones, by the balance heuristic.
+
+    Args:
+      incoming, base, gloss: n directions that `sample` drew for outgoing ones of their groups, one for each, and surfaces.
+      group: first and last but one of each one's group among the outgoing directions.
+      outgoing, factor: all directions, and how often each counts in each of the sums.
+    Returns:
+      The sum over a group of factor times `evaluate`, over the sum of `pdf`; 0 for directions below the surface.
+    """
+    worth = np.empty((len(incoming), factor.shape[1], 3), np.float32)
+    _shared(incoming, base, gloss, group, outgoing, factor, *tables(), worth)
+    return worth
 
 
 def sample_visible(
@@ -101,7 +123,7 @@ def invert_visible(facing: Directions, outgoing: Directions, alpha: Float[np.nda
 
 def albedo(cosine: Float[np.ndarray, " n"], roughness: float, f0: float) -> Float64[np.ndarray, " n"]:
     """Share of light along directions of some cosine to the normal that facets of reflectance f0 send back."""
-    table, _ = _tables()
+    table, _ = tables()
     found = np.empty(len(cosine))
     _albedos(cosine, roughness, f0, table, found)
     return found
@@ -109,12 +131,12 @@ def albedo(cosine: Float[np.ndarray, " n"], roughness: float, f0: float) -> Floa
 
 def mean_albedo(roughness: float, f0: float) -> float:
     """The same of light from everywhere."""
-    _, means = _tables()
-    return _between_means(means, float(roughness), float(f0))
+    _, means = tables()
+    return between_means(means, float(roughness), float(f0))
 
 
 @lru_cache(maxsize=1)
-def _tables() -> tuple[np.ndarray, np.ndarray]:
+def tables() -> tuple[np.ndarray, np.ndarray]:
     """Albedos of facets by roots of roughness and cosine, f0 times the first plus the second; and their means.
 
     The means are those of what is interpolated, so that the diffuse part gives back exactly what the table takes.
@@ -158,7 +180,7 @@ def _visible_all(u: np.ndarray, outgoing: np.ndarray, alpha: np.ndarray, facing:
 
 
 @compiled
-def _root(alpha: float, cosine: float) -> float:
+def root(alpha: float, cosine: float) -> float:
     """Of Smith's term: what a direction's facets hide."""
     return np.sqrt(alpha * alpha + (1 - alpha * alpha) * cosine * cosine)
 
@@ -175,7 +197,7 @@ def _facets(outgoing: np.ndarray, incoming: np.ndarray, alpha: float) -> tuple[f
 
 
 @compiled
-def _between(table: np.ndarray, roughness: float, cosine: float, f0: float) -> float:
+def between(table: np.ndarray, roughness: float, cosine: float, f0: float) -> float:
     """Albedo of facets, between the table's nodes."""
     row = np.sqrt((roughness - SMOOTHEST) / (1 - SMOOTHEST)) * (table.shape[0] - 1)
     column = np.sqrt(np.sqrt(cosine)) * (table.shape[1] - 1)
@@ -190,7 +212,8 @@ def _between(table: np.ndarray, roughness: float, cosine: float, f0: float) -> f
 
 
 @compiled
-def _between_means(means: np.ndarray, roughness: float, f0: float) -> float:
+def between_means(means: np.ndarray, roughness: float, f0: float) -> float:
+    """The same of light from everywhere."""
     row = np.sqrt((max(roughness, SMOOTHEST) - SMOOTHEST) / (1 - SMOOTHEST)) * (len(means) - 1)
     r = min(int(row), len(means) - 2)
     down = row - r
@@ -200,7 +223,7 @@ def _between_means(means: np.ndarray, roughness: float, f0: float) -> float:
 @compiled
 def _albedos(cosine: np.ndarray, roughness: float, f0: float, table: np.ndarray, found: np.ndarray) -> None:
     for i in range(len(cosine)):
-        found[i] = _between(table, max(roughness, SMOOTHEST), cosine[i], f0)
+        found[i] = between(table, max(roughness, SMOOTHEST), cosine[i], f0)
 
 
 @compiled
@@ -217,7 +240,7 @@ def _integrate(rough: np.ndarray, tilt: np.ndarray, table: np.ndarray) -> None:
                 along = a * x + c * z
                 under = 2 * along * c - z
                 if under > 0:
-                    share = under * (z + _root(alpha, z)) / (z * _root(alpha, under) + under * _root(alpha, z))
+                    share = under * (z + root(alpha, z)) / (z * root(alpha, under) + under * root(alpha, z))
                     whole += share
                     grazing += share * max(0.0, 1 - along) ** 5
             table[r, t, 0], table[r, t, 1] = (whole - grazing) / _LATTICE, grazing / _LATTICE
@@ -229,8 +252,8 @@ def _odds(outgoing: np.ndarray, base: np.ndarray, gloss: np.ndarray, table: np.n
     roughness, metallic, dielectric = max(float(gloss[0]), SMOOTHEST), float(gloss[1]), float(gloss[2])
     colour = (float(base[0]) + float(base[1]) + float(base[2])) / 3
     out = float(outgoing[2])
-    facets = _between(table, roughness, out, dielectric + metallic * (colour - dielectric))
-    diffuse = (1 - metallic) * colour * (1 - _between(table, roughness, out, dielectric))
+    facets = between(table, roughness, out, dielectric + metallic * (colour - dielectric))
+    diffuse = (1 - metallic) * colour * (1 - between(table, roughness, out, dielectric))
     return facets / (facets + diffuse)
 
 
@@ -245,11 +268,11 @@ def _terms(
     roughness, metallic, dielectric = max(float(gloss[0]), SMOOTHEST), float(gloss[1]), float(gloss[2])
     alpha = roughness * roughness
     dense, grazing = _facets(outgoing, incoming, alpha)
-    lobe = 0.5 * dense * under / (out * _root(alpha, under) + under * _root(alpha, out))
-    diffuse = (1 - _between(table, roughness, out, dielectric)) * (1 - _between(table, roughness, under, dielectric))
-    diffuse *= (1 - metallic) * under / (np.pi * (1 - _between_means(means, roughness, dielectric)))
+    lobe = 0.5 * dense * under / (out * root(alpha, under) + under * root(alpha, out))
+    diffuse = (1 - between(table, roughness, out, dielectric)) * (1 - between(table, roughness, under, dielectric))
+    diffuse *= (1 - metallic) * under / (np.pi * (1 - between_means(means, roughness, dielectric)))
     odds = _odds(outgoing, base, gloss, table)
-    density = odds * dense / (2 * (out + _root(alpha, out))) + (1 - odds) * under / np.pi
+    density = odds * dense / (2 * (out + root(alpha, out))) + (1 - odds) * under / np.pi
     return (1 - grazing) * lobe, grazing * lobe, diffuse, density
 
 
@@ -311,3 +334,37 @@ def _sample(
             f0 = gloss[i, 2] + gloss[i, 1] * (base[i, channel] - gloss[i, 2])
             value = f0 * mirrored + grazing + base[i, channel] * diffuse
             weight[i, channel] = value / density if density > 0 else 0.0
+
+
+@compiled
+def _shared(
+    incoming: np.ndarray,
+    base: np.ndarray,
+    gloss: np.ndarray,
+    group: np.ndarray,
+    outgoing: np.ndarray,
+    factor: np.ndarray,
+    table: np.ndarray,
+    means: np.ndarray,
+    worth: np.ndarray,
+) -> None:
+    factors = factor.shape[1]
+    sums = np.empty((3, factors))
+    for i in range(len(incoming)):
+        worth[i] = 0
+        if not incoming[i, 2] > 0:
+            continue
+        sums[:] = 0
+        total = 0.0
+        for j in range(group[i, 0], group[i, 1]):
+            mirrored, grazing, diffuse, density = _terms(outgoing[j], incoming[i], base[i], gloss[i], table, means)
+            total += density
+            for k in range(factors):
+                sums[0, k] += factor[j, k] * mirrored
+                sums[1, k] += factor[j, k] * grazing
+                sums[2, k] += factor[j, k] * diffuse
+        if total > 0:
+            for channel in range(3):
+                f0 = gloss[i, 2] + gloss[i, 1] * (base[i, channel] - gloss[i, 2])
+                for k in range(factors):
+                    worth[i, k, channel] = (f0 * sums[0, k] + sums[1, k] + base[i, channel] * sums[2, k]) / total

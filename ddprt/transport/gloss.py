@@ -6,14 +6,15 @@ that the path came from, and each light is weighed by that; paths go on where th
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from ddprt import warp
-from ddprt.axes import Bool, Float32, Int32
+from ddprt.axes import Bool, Float32, Int, Int32
 from ddprt.scene.material import Material, bilinear
 from ddprt.scene.mesh import Scene
-from ddprt.transport import ggx
+from ddprt.transport import ggx, weighing
 from ddprt.transport.embree import Tracer, lifted
 from ddprt.transport.glossiness import glossy
 from ddprt.transport.walk import MAX_SURVIVAL, SURVIVAL, Vertices
@@ -44,7 +45,11 @@ class Lobes:
         incoming, weight = ggx.sample(self.outgoing, u, self.base, self.gloss)
         return warp.to_world(incoming, self.frames), weight
 
-    def part(self, which: slice) -> "Lobes":
+    def density(self, directions: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, " n"]:
+        """Of what `scattered` gives, per steradian, at world directions."""
+        return ggx.pdf(self.outgoing, _to_local(directions, self.frames), self.base, self.gloss)
+
+    def part(self, which: slice | Int[np.ndarray, " some"]) -> "Lobes":
         """Some of them."""
         return Lobes(self.frames[which], self.outgoing[which], self.base[which], self.gloss[which])
 
@@ -89,9 +94,12 @@ class GlossyVertices:
 
     def lit_from(self, directions: Float32[np.ndarray, "n 3"]) -> Vertices:
         """What each W/m² that arrives from directions is worth to the receivers."""
-        cosine = np.einsum("dn,nd->n", self.place[3:], directions)
-        factor = np.divide(np.float32(np.pi), cosine, out=np.zeros_like(cosine), where=cosine > 0)
-        return replace(self.there, throughput=self.there.throughput * (self.lobes.reflected(directions).T * factor))
+        lobes, there = self.lobes, self.there
+        return replace(there, throughput=weighing.weigh(self._held, lobes.frames, lobes.outgoing, directions, there.throughput))
+
+    @cached_property
+    def _held(self) -> Float32[np.ndarray, "n 11"]:
+        return weighing.prepared(self.lobes.outgoing, self.lobes.base, self.lobes.gloss)
 
     def go_on(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Origins and directions of the paths that survive roulette, their throughput and receivers."""
@@ -134,6 +142,13 @@ class Surfaces:
         directions: Float32[np.ndarray, "n 3"],
     ) -> Lobes:
         """Surfaces that rays of some directions hit, all of them glossy and from their front."""
+        frames = self.tracer.frames[triangle]
+        return Lobes(frames, _to_local(-directions, frames), *self.finish(triangle, u, v))
+
+    def finish(
+        self, triangle: Int32[np.ndarray, " n"], u: Float32[np.ndarray, " n"], v: Float32[np.ndarray, " n"]
+    ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
+        """Base colour and gloss at places of glossy triangles."""
         weights = np.stack([1 - u - v, u, v], 1)
         base, gloss = self.scene.albedo_at(triangle, weights).astype(np.float32), self.gloss[triangle]
         for index, material in enumerate(self.scene.materials):
@@ -141,8 +156,7 @@ class Surfaces:
                 chosen = self.scene.material[triangle] == index
                 uv = self.scene.uv_at(triangle[chosen], weights[chosen])
                 gloss[chosen, :2] *= bilinear(material.gloss.texture, uv)
-        frames = self.tracer.frames[triangle]
-        return Lobes(frames, _to_local(-directions, frames), base, gloss)
+        return base, gloss
 
     def met(
         self,

@@ -66,6 +66,11 @@ GRAZING = (1.0, 0.85, 0.62, 0.43, 0.29, 0.2, 0.14, 0.1, 0.075, 0.06, 0.05)
 """Bounds of what facets of no reflectance at normal incidence send back from any direction, by roughness 0, 0.1, ... 1."""
 
 
+def least_roughness(gloss: Gloss) -> float:
+    """Of a material, texture included."""
+    return _extremes(gloss)[0]
+
+
 def _extremes(gloss: Gloss) -> tuple[float, float]:
     """Least roughness and largest metallic, textures included."""
     rough, metal = (1.0, 1.0) if gloss.texture is None else (gloss.texture[..., 0].min(), gloss.texture[..., 1].max())

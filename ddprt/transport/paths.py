@@ -11,13 +11,14 @@ spared its shadow ray, by roulette again. No step of it is biased. What it canno
 their grain, as those of the operator do.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ddprt import seeds
-from ddprt.axes import Float32, Int
+from ddprt.axes import Float32, Float64, Int
 from ddprt.lights import Lighting
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
@@ -26,10 +27,13 @@ from ddprt.transport.embree import Tracer
 from ddprt.transport.gather import Receivers
 from ddprt.transport.glossiness import glossy_surfaces
 from ddprt.transport.shading import shade, shift
-from ddprt.transport.walk import albedo_of, starts, walked
+from ddprt.transport.walk import Meetings, albedo_of, starts, walked
 
 _PROBED, _PILOT = 512, 32  # texels, and paths of each in two independent runs, that predict how many are needed
 _LEAST, _MOST = 8, 8192  # paths per texel that "auto" may choose
+
+Shading = Callable[[Meetings, np.random.Generator, Float64[np.ndarray, "lightings receivers 3"]], None]
+"""Adds to receivers what vertices give them under every lighting; the random numbers are for it alone."""
 
 
 def trace_paths(
@@ -62,8 +66,27 @@ def trace_paths(
     Yields:
       The number of texels of each finished tile, in order, the skipped ones included.
     """
-    receivers = Receivers.texels(atlas, samples, seed, f"{stream} paths", texels)
     lamps = [[(light, shift(light)) for light in centred(tracer, lighting)] for lighting in lightings]
+    settings: dict[str, Any] = {"samples": samples, "seed": seed, "stream": stream, "bounces": bounces}
+    yield from follow(tracer, scene, atlas, partial(shade, tracer, lamps), out, skip=skip, texels=texels, **settings)
+
+
+def follow(
+    tracer: Tracer,
+    scene: Scene,
+    atlas: Atlas,
+    shading: Shading,
+    out: Float32[np.ndarray, "lightings texels 3"],
+    *,
+    samples: int,
+    seed: int,
+    stream: str,
+    bounces: int = -1,
+    skip: int = 0,
+    texels: Int[np.ndarray, " chosen"] | None = None,
+) -> Iterator[int]:
+    """The same with light of any kind: `shading` tells what vertices are worth."""
+    receivers = Receivers.texels(atlas, samples, seed, f"{stream} paths", texels)
     albedo, gloss = albedo_of(scene), glossy_surfaces(tracer, scene)
 
     def work(item: tuple[int, slice]) -> int:
@@ -71,11 +94,11 @@ def trace_paths(
         if index >= skip:
             address = *stream.encode(), samples, int(receivers.patch[tile.start])
             walk, chance = (seeds.stream(seed, name, *address) for name in ("path walk", "path lights"))
-            sums = np.zeros((len(lamps), tile.stop - tile.start, 3))
+            sums = np.zeros((len(out), tile.stop - tile.start, 3))
             for start in starts(tracer, receivers, tile):
                 for met in walked(tracer, albedo, start, walk, bounces, gloss):
                     for part in met.blocks():
-                        shade(tracer, lamps, part, chance, sums)
+                        shading(part, chance, sums)
             with np.errstate(over="ignore"):  # what is not finite is refused where light is stored
                 out[:, receivers.patch[tile]] = sums / samples
         return tile.stop - tile.start
@@ -101,18 +124,33 @@ def choose_samples(
       target: RMSE of all maps over their mean; more than so many thousand paths are never chosen.
       seed, stream: address of the random numbers; independent of those of `trace_paths` with that stream.
     """
+    tracing = partial(trace_paths, tracer, scene, atlas, lightings)
+    return samples_for(tracing, atlas, len(lightings), target=target, seed=seed, stream=stream, bounces=bounces)
+
+
+def samples_for(
+    tracing: Callable[..., Iterator[int]],
+    atlas: Atlas,
+    lightings: int,
+    *,
+    target: float,
+    seed: int,
+    stream: str,
+    bounces: int = -1,
+) -> tuple[int, float]:
+    """The same for paths of any kind: `tracing` is `follow` or the like, from `out` on."""
     odds = atlas.area / atlas.area.sum()
     drawn = seeds.stream(seed, "path probes", *stream.encode()).choice(atlas.count, _PROBED, p=odds)
     texels, times = np.unique(drawn, return_counts=True)
     runs = []
     for run in range(2):
-        out = np.zeros((len(lightings), atlas.count, 3), np.float32)
+        out = np.zeros((lightings, atlas.count, 3), np.float32)
         address = f"{stream} pilot {run}"
         settings: dict[str, Any] = {"samples": _PILOT, "seed": seed, "stream": address, "bounces": bounces, "texels": texels}
-        for _ in trace_paths(tracer, scene, atlas, lightings, out, **settings):
+        for _ in tracing(out, **settings):
             pass
         runs.append(out[:, texels].astype(np.float64))
-    values = 3 * len(lightings) * _PROBED
+    values = 3 * lightings * _PROBED
     mean = float(((runs[0] + runs[1]) / 2).sum((0, 2)) @ times) / values
     if mean == 0:
         return _LEAST, 0.0

@@ -29,7 +29,7 @@ from ddprt.transport.near import NearField, columns_of
 from ddprt.transport.operator import Operator
 
 ORDER = 2
-_CALL = 1 << 14  # rays of one call
+CALL = 1 << 14  # rays of one call
 _FEW, _MANY = 64, 256  # rays of the probes that tell how noise falls, twice each
 _PILOTS, _LIGHTINGS = 64, 32  # probes and lightings that are looked at
 _FEWEST, _MOST = 64, 1 << 16  # rays that are traced unasked
@@ -99,7 +99,7 @@ def gather(
       seed, stream: address of the random numbers.
       near: looks closer at near senders, if given.
     """
-    tracer, count, step = operator.tracer, harmonics.count(ORDER), max(1, _CALL // rays)
+    tracer, count, step = operator.tracer, harmonics.count(ORDER), max(1, CALL // rays)
     cosine = harmonics.clamped_cosine(ORDER) * (4 * np.pi / rays / np.pi)  # radiance is radiosity / pi
 
     def work(first: int) -> np.ndarray:

@@ -123,13 +123,13 @@ def _paths(
             where = triangle[shiny], hits.u[keep][shiny], hits.v[keep][shiny]
             lobes = gloss.lobes(*where, directions[keep][shiny]) if len(shiny) else None
         if lobes:
-            light[shiny] = _reflected(tracer, lights, positions[shiny], normals[shiny], lobes, numbers[:, shiny])
+            light[shiny] = reflected(tracer, lights, positions[shiny], normals[shiny], lobes, numbers[:, shiny])
         indirect[alive] += throughput * light
         depth += 1
     return direct, indirect
 
 
-def _reflected(
+def reflected(
     tracer: Tracer,
     lights: Lighting,
     positions: Float32[np.ndarray, "n 3"],

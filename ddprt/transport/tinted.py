@@ -19,15 +19,19 @@ def into_groups(
     first: int,
     total: np.ndarray,
 ) -> None:
-    """Adds the light of points that are not in shadow to their groups."""
-    red, green, blue = np.float32(colour[0]), np.float32(colour[1]), np.float32(colour[2])
+    """Darkens the points in shadow, and adds each group's sum of light times a colour."""
     for ray in range(len(seen)):
-        if seen[ray]:
-            i = np.int64(target[ray])
-            group = first + i // samples
-            total[group, 0] += weight[i] * tint[0, i] * red
-            total[group, 1] += weight[i] * tint[1, i] * green
-            total[group, 2] += weight[i] * tint[2, i] * blue
+        weight[target[ray]] = weight[target[ray]] if seen[ray] else np.float32(0)
+    red, green, blue = np.float32(colour[0]), np.float32(colour[1]), np.float32(colour[2])
+    start = 0
+    for group in range(first, min(first + len(weight) // samples, len(total))):
+        light = np.float32(0), np.float32(0), np.float32(0)
+        for i in range(start, start + samples):
+            light = light[0] + weight[i] * tint[0, i], light[1] + weight[i] * tint[1, i], light[2] + weight[i] * tint[2, i]
+        start += samples
+        total[group, 0] += light[0] * red
+        total[group, 1] += light[1] * green
+        total[group, 2] += light[2] * blue
 
 
 @compiled

@@ -212,7 +212,10 @@ def _against_measurement(budget: Budget, config: Config) -> Knob | None:
     return Knob("measurement", "points.count", config.points.count, 2 * config.points.count, expected, why, True)
 
 
-def _against_regularisation(budget: Budget, config: Config) -> Knob:
+def _against_regularisation(budget: Budget, config: Config) -> Knob | None:
+    """None where the lightings come from a file: no more of their kind can be drawn."""
+    if config.lightings.file:
+        return None
     yard = budget.yardsticks
     knob = Knob("regularisation", "lightings.train", yard.train, 2 * yard.train, 0.0, _LOOKED, True, 2.0)
     if config.budget.abundance < 2:

@@ -37,7 +37,7 @@ class Yardsticks:
         same distribution; its held-out ones are those that the error is taken apart on.
       truth: the same held-out lightings by unbiased paths; `clean` itself where the run is unbiased.
       elsewhere: as many lightings as `clean` trains on, of the held-out ones' distribution; None where that is the same.
-      train: training lightings of the run.
+      train: how many training lightings the run has.
     """
 
     clean: Dataset
@@ -54,14 +54,15 @@ class Yardsticks:
     def unseen(self) -> list[tuple[Dataset, list[int]]]:
         """What the best transfer is fitted on: lightings as held out that the run has not trained on, and those held out.
 
+        Where no lightings abound, those of validation are all that the run has not trained on besides.
+
         The held-out ones are among them so that what it leaves of theirs is orthogonal to what it answers: in least squares
         that holds for the lightings that are fitted, and for others only but for the fit's own luck.
         """
         clean, held_out = self.clean, (self.clean, self.clean.split("test"))
         if self.elsewhere is not None:
             return [(self.elsewhere, self.elsewhere.split("train")), held_out]
-        fresh = clean.split("train")[self.train :]
-        return [(clean, fresh), held_out] if fresh else [held_out]
+        return [(clean, clean.split("train")[self.train :] or clean.split("validation")), held_out]
 
     def bounded(self, data: Dataset, count: int) -> Dataset:
         """A bake with its first so many training lightings alone."""
@@ -93,46 +94,58 @@ class Bakery:
         """All that the chain needs.
 
         Raises:
-          UserError: the lightings come from a file, so that no more of their kind can be drawn; points chosen by lightings.
+          UserError: the lightings come from a file that holds out too few, or stands beside a scenario.
         """
         budget, integrator = self.config.budget, self.config.transport.integrator
-        if self.config.points.choose != "blue-noise":
-            raise UserError(
-                f'points.choose: got "{self.config.points.choose}", expected "blue-noise": points that are chosen by the '
-                "training lightings would lie elsewhere in every bake of the budget; choose them so to take an error apart"
-            )
-        if self.config.lightings.file:
-            raise UserError(
-                f"lightings.file: got {self.config.lightings.file}, expected a distribution that the budget can draw more "
-                "lightings from; describe the lightings by [lightings] without a file"
-            )
         train, validation = (self._own(split) for split in ("train", "validation"))
-        count = len(train) * budget.abundance
-        held_out = self._drawn("test", budget.lightings, scenario=True)
+        if self.config.lightings.file:
+            count, held_out = len(train), self._held_out_of_file(len(validation))
+        else:
+            count, held_out = len(train) * budget.abundance, self._drawn("test", budget.lightings, scenario=True)
         abundant = [*train, *self._drawn("abundance", count - len(train))]
         # The unbiased integrators share one truth; the slower of them only traces what the faster would.
         unbiased = integrator in _UNBIASED
         quiet = {"target_noise": budget.noise, "samples": "auto", "test_samples": "auto", "footprint": 0.0, "denoise": False}
         clean_settings = quiet | {"integrator": "paths" if unbiased else "operator"}
-        clean = self.bake("clean", {"train": abundant, "validation": validation, "test": held_out}, transport=clean_settings)
+        clean = self.bake(
+            "clean", {"train": abundant, "validation": validation, "test": held_out}, transport=clean_settings, pinned=True
+        )
         few = {"train": train[:1], "validation": validation[:1]}
         elsewhere = None
         if budget.scenario:
             there = {**few, "train": self._drawn("abundance", count, scenario=True), "test": held_out[:1]}
-            elsewhere = self.bake("scenario", there, transport=clean_settings | {"test_samples": 2})
+            elsewhere = self.bake("scenario", there, transport=clean_settings | {"test_samples": 2}, pinned=True)
         if unbiased:
             return Yardsticks(clean, clean, elsewhere, len(train))
         paths = {"integrator": "paths", "samples": 1, "test_samples": budget.truth_samples}
         # Halves take the noise s of a truth out of every square but for about 2 s² / sqrt(texels), which is to be at most the
         # square of the noise that counts as none.
         noise = min(1.0, budget.noise * (clean.covered.sum() / 4) ** 0.25)
-        truth = self.bake("truth", {**few, "test": held_out}, transport=paths | {"target_noise": float(noise)})
+        settings = paths | {"target_noise": float(noise)}
+        truth = self.bake("truth", {**few, "test": held_out}, transport=settings, pinned=True)
         return Yardsticks(clean, truth, elsewhere, len(train))
 
     def bake(
-        self, name: str, lightings: Mapping[str, Sequence[Lighting]], *, config: Config | None = None, transport: dict[str, Any]
+        self,
+        name: str,
+        lightings: Mapping[str, Sequence[Lighting]],
+        *,
+        config: Config | None = None,
+        transport: dict[str, Any],
+        pinned: bool = False,
     ) -> Dataset:
-        """A bake of given lightings; what is not said is as in the run, the depth of its samples included."""
+        """A bake of given lightings; what is not said is as in the run, the depth of its samples included.
+
+        Args:
+          name: of its folder.
+          lightings: by split.
+          config: another than the run's.
+          transport: settings that differ from it.
+          pinned: measured at the points of the run also where these are chosen by its training lightings.
+        """
+        splits = None
+        if pinned and self.config.points.choose == "qr":
+            lightings, splits = self._chosen_by_own(lightings)
         config = config or self.config
         depth = DEPTH if self.data.samples.depth > 0 else 0.0
         depth = depth if config.points.depth == "auto" else config.points.depth
@@ -141,6 +154,7 @@ class Bakery:
                 **config.model_dump(include={"seed", "scene", "atlas", "points", "fit"}),
                 "transport": config.transport.model_dump() | transport,
                 "points": config.points.model_dump() | {"depth": depth},
+                "effects": {"glossy_layers": False},
             }
         )
         records = {split: [lighting_json(lighting) for lighting in listed] for split, listed in lightings.items()}
@@ -152,11 +166,46 @@ class Bakery:
             if other != place:
                 shutil.rmtree(other)
         self.progress.say(f"budget: {name}: {', '.join(f'{len(rows)} {split}' for split, rows in records.items())} lightings")
-        return bake(self.scene, lightings, config=config, out=place, progress=self.progress)
+        baked = bake(self.scene, lightings, config=config, out=place, progress=self.progress)
+        if splits is None:
+            return baked
+        entries = [{**entry, "split": split} for entry, split in zip(baked.description["lightings"], splits, strict=True)]
+        return replace(baked, description={**baked.description, "lightings": entries})
 
     def more(self, count: int, *, scenario: bool = False) -> list[Lighting]:
         """Training lightings beyond those of the run, the first of the abundant ones; or of the scenario's."""
         return self._drawn("abundance", count, scenario=scenario)
+
+    def _chosen_by_own(self, lightings: Mapping[str, Sequence[Lighting]]) -> tuple[dict[str, list[Lighting]], list[str]]:
+        """The same lightings so that a bake trains on those of the run alone, which choose its points, and what each is for.
+
+        What else is to be trained on stands among those of validation, of which a bake of its own makes no other use.
+        """
+        train, own = [*lightings["train"]], self._own("train")
+        kept = len(own) if train[: len(own)] == own else len(train) if train == own[: len(train)] else 0
+        given = {"train": own, "validation": [*train[kept:], *lightings["validation"]], "test": [*lightings["test"]]}
+        splits = ["train"] * kept + ["spare"] * (len(own) - kept) + ["train"] * (len(train) - kept)
+        splits += ["validation"] * len(lightings["validation"]) + ["test"] * len(lightings["test"])
+        return given, splits
+
+    def _held_out_of_file(self, validation: int) -> list[Lighting]:
+        """Those that the file of the lightings holds out, `budget.lightings` of them at most."""
+        config = self.config
+        if config.budget.scenario:
+            raise UserError(
+                f"budget.scenario: got {config.budget.scenario} beside lightings.file {config.lightings.file}, expected none, "
+                "since it describes how lightings are drawn; leave one of the two out"
+            )
+        found = self._own("test")[: config.budget.lightings]
+        points = config.fit.points or config.points.count
+        if validation + len(found) <= points:
+            raise UserError(
+                f"lightings.file: got {validation} + {len(found)} of {config.lightings.file} for validation and test, expected "
+                f"more than the {points} points, since the best that these can tell is fitted on lightings that were "
+                "not trained on, and no more of a file's kind can be drawn; share out more of the file to lightings.test and "
+                "raise budget.lightings, or lower fit.points"
+            )
+        return found
 
     def _own(self, split: str) -> list[Lighting]:
         return [self.data.lightings[index] for index in self.data.split(split)]

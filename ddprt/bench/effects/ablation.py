@@ -8,7 +8,7 @@ import json
 import shutil
 import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -20,6 +20,7 @@ from ddprt.axes import Float32, Int
 from ddprt.bench.measure.trial import environment
 from ddprt.config import Config
 from ddprt.dataset.generate import bake
+from ddprt.dataset.layers import Layer, LayerData, layers
 from ddprt.dataset.splits import SPLITS, choose_lightings
 from ddprt.dataset.store import Dataset
 from ddprt.files import make_folder, write_text
@@ -71,6 +72,7 @@ class Row:
       bound: what the plan says that this can be at most; None: unbounded.
       seconds: of the bake, median; without what takes the same whatever is simulated.
       rays: of the bake.
+      layers: of each layer as planned, `relative_rmse` and `noise` as above; a bake that lacks it answers with darkness.
     """
 
     variant: str
@@ -83,6 +85,7 @@ class Row:
     bound: float | None
     seconds: float
     rays: int
+    layers: dict[str, dict[str, float | None]] = field(default_factory=dict)
 
 
 def ablation(config: Config, folder: Path, progress: Progress) -> list[Row]:
@@ -117,7 +120,16 @@ def ablation(config: Config, folder: Path, progress: Progress) -> list[Row]:
                         rays[index], data[index] = sum(int(s.get("rays", 0)) for s in own.stages), baked
                     stage.advance()
         rows = [
-            _row(variant, scene, lightings["test"], data[0], data[index], median(seconds[index]), rays[index])
+            _row(
+                variant,
+                scene,
+                lightings["test"],
+                data[0],
+                data[index],
+                median(seconds[index]),
+                rays[index],
+                config.probes.asked,
+            )
             for index, variant in enumerate(found)
         ]
     about = {"schema": SCHEMA, "config": config.to_toml(), "environment": environment()}
@@ -130,7 +142,7 @@ def ablation(config: Config, folder: Path, progress: Progress) -> list[Row]:
 def variants(scene: Scene, lightings: Sequence[Lighting], config: Config) -> list[Variant]:
     """As planned, without each effect that is called for and can be forced, and with fewer bounces where light bounces."""
     asked = config.transport.bounces
-    planned = plan(scene, lightings, bounces=asked)
+    planned = plan(scene, lightings, bounces=asked, probes=config.probes.asked)
     names = [effect.name for effect in planned.effects if effect.called and EFFECTS[effect.name].without]
     fewer = [count for count in (0, 1) if planned.bounces < 0 or count < planned.bounces]
     return [
@@ -147,21 +159,32 @@ def table(rows: Sequence[Row]) -> str:
         "| bake | relative RMSE | of it noise | share of light | largest change | bound | seconds | of planned | rays |",
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
+    for name in first.layers:
+        lines = [f"{lines[0]} {name} | of it noise |", f"{lines[1]} --- | --- |"]
     for row in rows:
         shares = [row.relative_rmse, row.noise, row.energy_share, row.largest_change]
         told = ["-" if value is None or not row.effect else f"{value:.2%}" for value in shares]
         bound = "-" if not row.effect else "none" if row.bound is None else f"{row.bound:.2%}"
         took = [f"{row.seconds:.3g}", f"{row.seconds / first.seconds:.3g}" if first.seconds > 0 else "-", amount(row.rays)]
-        lines.append(f"| {' | '.join([row.variant, *told, bound, *took])} |")
+        parts = [part[key] for part in row.layers.values() for key in ("relative_rmse", "noise")]
+        layered = ["-" if value is None or not row.effect else f"{value:.2%}" for value in parts]
+        lines.append(f"| {' | '.join([row.variant, *told, bound, *took, *layered])} |")
     if len(rows) == 1:
         lines.append("\nNothing that is called for can be left out.")
     return "\n".join(lines) + "\n"
 
 
 def _row(
-    variant: Variant, scene: Scene, lightings: Sequence[Lighting], planned: Dataset, other: Dataset, seconds: float, rays: int
+    variant: Variant,
+    scene: Scene,
+    lightings: Sequence[Lighting],
+    planned: Dataset,
+    other: Dataset,
+    seconds: float,
+    rays: int,
+    probes: str,
 ) -> Row:
-    decided = plan(variant.scene(scene), lightings, bounces=variant.bounces)
+    decided = plan(variant.scene(scene), lightings, bounces=variant.bounces, probes=probes)
     effect = next((effect for effect in decided.effects if effect.name == variant.effect), None)
     indices = planned.split("test")
     weight = planned.area[:, None] / planned.area.sum()
@@ -189,7 +212,31 @@ def _row(
         effect.bound if effect else 0.0,
         seconds,
         rays,
+        {layer.name: _of_layer(planned, other, layer) for layer in layers(planned)},
     )
+
+
+def _of_layer(planned: Dataset, other: Dataset, layer: Layer) -> dict[str, float | None]:
+    """How far a layer's held-out light is from that as planned, and what noise makes of it; None where that is black."""
+    own, indices = LayerData.of(planned, layer), planned.split("test")
+    theirs = next((LayerData.of(other, found) for found in layers(other) if found.name == layer.name), None)
+    dark = np.zeros((len(indices), len(own.area), 3), np.float32)
+
+    def squares(light: np.ndarray) -> float:
+        return float(np.einsum("lec,lec,e->", light, light, own.area, dtype=np.float64))
+
+    def answered(part: LayerData | None) -> np.ndarray:
+        """With the light of what glows, as a runtime answers."""
+        light = part.maps("indirect", indices) if part else dark
+        return light if part is None or part.constant is None else light + part.constant
+
+    whole, there = answered(own), answered(theirs)
+    unsure = [part.maps("noise", indices) if part else dark for part in (own, theirs)]
+    total = squares(whole)
+    if not total > 0:
+        return {"relative_rmse": None, "noise": None}
+    noise = sum(map(squares, unsure))
+    return {"relative_rmse": float(np.sqrt(squares(whole - there) / total)), "noise": float(np.sqrt(noise / total))}
 
 
 def counterparts(planned: Dataset, other: Dataset) -> Int[np.ndarray, " texels"]:

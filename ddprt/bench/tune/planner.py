@@ -59,7 +59,8 @@ class Trial:
     Attributes:
       place: where.
       bases: numbers of bases that were scored, rising.
-      errors: relative RMSE at each, and its standard error over held-out lightings, as a share.
+      errors: relative RMSE at each.
+      error_spread, error_skew: of its logarithm over held-out lightings, see `ddprt.bench.tune.held_out.spread_of`.
       frame_us, megabytes: at each, by precision.
       bake_seconds, fit_seconds: of the whole.
     """
@@ -68,6 +69,7 @@ class Trial:
     bases: tuple[int, ...]
     errors: tuple[float, ...]
     error_spread: float
+    error_skew: float
     frame_us: tuple[float, ...]
     megabytes: dict[str, tuple[float, ...]]
     bake_seconds: float
@@ -76,14 +78,26 @@ class Trial:
 
 @dataclass(frozen=True)
 class Guess:
-    """Logarithm of a quantity: what is expected, and how far off that may be."""
+    """Logarithm of a quantity: what is expected, how far off that may be, and how much farther off above than below.
+
+    Attributes:
+      mean, spread: of a Gaussian, were it not skewed.
+      skew: third moment of the estimate over the cube of its spread; above 0 where few large values make up a mean, of which
+        a sample mostly has too few, and then looks both smaller and surer than it is.
+    """
 
     mean: float
     spread: float
+    skew: float = 0.0
 
     def chance(self, limit: float) -> float:
-        """Logarithm of the chance that it is within a limit."""
-        return float(log_ndtr((log(limit) - self.mean) / max(self.spread, 1e-6)))
+        """Logarithm of the chance that it is within a limit.
+
+        Hall's cubic, which turns a skewed Student's t into a Gaussian to second order and rises everywhere (P. Hall, On the
+        removal of skewness by transformation, J. R. Stat. Soc. B 54, 1992). Without skew it is the Gaussian.
+        """
+        t, skew = (self.mean - log(limit)) / max(self.spread, 1e-6), self.skew
+        return float(log_ndtr(-(t + skew * t**2 / 3 + skew**2 * t**3 / 27 + skew / 6)))
 
 
 @dataclass(frozen=True)
@@ -147,6 +161,33 @@ class Planner:
     def add(self, trial: Trial) -> None:
         """Learns from a trial."""
         self.trials.append(trial)
+        self.barred.discard(trial.place)  # whatever others let expect
+        self._learn()
+
+    def replace(self, trial: Trial) -> None:
+        """Learns what a place is found to be when it is looked at again."""
+        self.trials = [trial if other.place == trial.place else other for other in self.trials]
+        self._learn()
+
+    def bar(self, place: Place, knob: str) -> int:
+        """Leaves out a place that cannot be baked, and those that cannot for the same reason.
+
+        Args:
+          place: that was tried.
+          knob: that is to blame. A resolution that cannot be unwrapped cannot whatever the others are; what has too few texels
+            for its points has too few for more of them. Any other leaves out the place alone.
+        Returns:
+          How many places are left out now that were not before.
+        """
+        before, at, tried = len(self.barred), KNOBS.index("points.count"), {trial.place for trial in self.trials}
+        self.barred |= {
+            other
+            for other in product(*self.values)
+            if other == place or (other[0] == place[0] and (knob == KNOBS[0] or (knob == KNOBS[at] and other[at] >= place[at])))
+        } - tried
+        return len(self.barred) - before
+
+    def _learn(self) -> None:
         rows = np.array([self._row(each.place) for each in self.trials])
         self._laws = {
             name: Law.of(rows, np.array([_told(name, each) for each in self.trials]), *_PRIOR[name]) for name in _PRIOR
@@ -166,6 +207,20 @@ class Planner:
     def rank(self, plan: Plan) -> Rank:
         """How good a plan is, as far as it is known."""
         return _rank(self.guesses(plan), self.limits)
+
+    def undecided(self, plan: Plan) -> bool:
+        """Whether more held-out lightings may tell if a plan meets the budget, which else it seems to meet.
+
+        While there may be more, it is decided when a chance of one in fifty is left that it is otherwise: looking again and
+        again would let chance in often enough if nine in ten were taken for sure each time.
+        """
+        guesses = self.guesses(plan)
+        error, limit = guesses["relative_rmse"], self.limits.get("relative_rmse")
+        if limit is None or error.spread <= _AGAIN:
+            return False
+        others = [name for name in self.limits if name != "relative_rmse"]
+        within = all(guesses[name].mean <= log(self.limits[name]) for name in others)
+        return within and log(_HOPELESS) < error.chance(limit) < log(1 - _HOPELESS)
 
     def hopeless(self, chance: float) -> bool:
         """Whether a chance is too small to go on."""
@@ -216,13 +271,14 @@ class Planner:
         self, told: tuple[Trial, bool, dict[str, Guess], dict[str, float]], bases: int, precision: str
     ) -> dict[str, Guess]:
         trial, known, laws, moved = told
-        error, spread = _between(trial.bases, trial.errors, bases), trial.error_spread
+        error, spread, skew = _between(trial.bases, trial.errors, bases), trial.error_spread, trial.error_skew
         if not known:
             # What is left at the most bases is the rest; what fewer add to it is truncation, the same wherever it is looked at.
             truncation, rest = max(error**2 - min(trial.errors) ** 2, 0.0), np.exp(2 * laws["rest"].mean)
             error = float(np.sqrt(truncation + rest))
-            spread = float(np.hypot(spread, rest / error**2 * laws["rest"].spread))
-        found = {"relative_rmse": Guess(log(max(error, _TINY)), max(spread, 1e-3))}
+            whole = float(np.hypot(spread, rest / error**2 * laws["rest"].spread))
+            spread, skew = whole, skew * (spread / whole) ** 3  # third moments add up, and a law's is 0
+        found = {"relative_rmse": Guess(log(max(error, _TINY)), max(spread, 1e-3), skew)}
         for name, curve in (("frame_us", trial.frame_us), ("megabytes", trial.megabytes[precision])):
             certain = known and bases in trial.bases
             found[name] = Guess(

@@ -12,6 +12,7 @@ import numpy as np
 from ddprt.bench.measure.settings import Setting, changed
 from ddprt.bench.measure.timing import timed
 from ddprt.bench.measure.trial import Workshop, about, environment, why
+from ddprt.bench.tune.held_out import HeldOut, error_of, spread_of
 from ddprt.bench.tune.planner import KNOBS, QUANTITIES, Place, Plan, Planner, Trial
 from ddprt.config import Config
 from ddprt.dataset.forecast import forecast
@@ -19,7 +20,6 @@ from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.files import alone_in, append_line, make_folder, write_text
 from ddprt.methods.svd_ridge import LinearTransfer
-from ddprt.report.metrics import Tally
 from ddprt.runtime.model import Model
 from ddprt.runtime.precision import shipped_bytes, stored
 from ddprt.runtime.train import fit_config
@@ -50,6 +50,7 @@ class Outcome:
       met: whether the budget is met.
       binding: the limit that stands in the way, or that was met with the least room.
       trials: bakes that were made.
+      held_out: lightings that the error was told on.
       setting: the plan as a configuration.
       limits: what was asked for.
     """
@@ -60,6 +61,7 @@ class Outcome:
     met: bool
     binding: str
     trials: int
+    held_out: int
     setting: Setting
     limits: dict[str, float]
 
@@ -105,6 +107,8 @@ class Search:
             count for count in BASES if count > (config.fit.centre == "mean")
         )  # the mean alone is another method
         self.planner = Planner(self.base, values, self.bases, _PRECISIONS, self.limits)
+        self.held_out = HeldOut(workshop)
+        self._failed = 0
 
     def run(self) -> Outcome:
         """Searches."""
@@ -116,12 +120,13 @@ class Search:
         while True:
             plan, chance = planner.next()
             tried = any(trial.place == plan.place for trial in planner.trials)
-            if tried and plan in verified:
-                break
-            if tried:
+            if tried and plan not in verified:
                 verified[plan] = self._verify(plan)
                 continue
-            if planner.hopeless(chance) or len(planner.trials) + len(planner.barred) >= self.config.tune.trials:
+            if self._more_lightings(plan if tried else self._best_tried()):
+                verified.clear()
+                continue
+            if tried or planner.hopeless(chance) or len(planner.trials) + self._failed >= self.config.tune.trials:
                 break
             progress.say(f"next: {self._name(plan.place)}, a chance of {chance:.0%}")
             self._tried(plan.place)
@@ -132,7 +137,22 @@ class Search:
         reached, chance, met = verified[plan], self._chance(plan), self._meets(verified[plan])
         room = {name: limit / reached[name] for name, limit in self.limits.items()}
         binding = min(room, key=lambda name: room[name]) if met else planner.binding()
-        return Outcome(plan, reached, chance, met, binding, len(planner.trials), self._setting(plan), self.limits)
+        trials, lightings = len(planner.trials), self.held_out.count
+        return Outcome(plan, reached, chance, met, binding, trials, lightings, self.setting(plan), self.limits)
+
+    def _more_lightings(self, plan: Plan) -> bool:
+        """Doubles the held-out lightings if that may decide about a plan, and scores all that was tried on them.
+
+        They never cost more than the trials have: another trial is what they are drawn in place of.
+        """
+        if not self.planner.undecided(plan):
+            return False
+        spent = sum(trial.bake_seconds + trial.fit_seconds for trial in self.planner.trials)
+        if not self.held_out.more(self.limits["relative_rmse"], spent):
+            return False
+        for trial in self.planner.trials:
+            self.planner.replace(self._scored_again(trial))
+        return True
 
     def _start(self) -> Place:
         """The base, or a coarser place where a forecast says that baking the base alone takes several budgets."""
@@ -159,10 +179,16 @@ class Search:
         try:
             self._try(place)
         except (UserError, MemoryError) as error:
-            self.workshop.progress.say(f"left out: {self._name(place)}: {why(error)}")
-            self.planner.barred.add(place)
+            self._failed += 1
+            self.bar(place, why(error))
             return False
         return True
+
+    def bar(self, place: Place, reason: str) -> None:
+        """Leaves out a place that cannot be baked, with all that cannot for the same reason, and tells so once."""
+        count = self.planner.bar(place, reason.partition(":")[0])  # an error begins with the setting that is to blame
+        alike = f", and {count - 1} more places for the same reason" if count > 1 else ""
+        self.workshop.progress.say(f"left out: {self._name(place)}{alike}: {reason}")
 
     def _try(self, place: Place) -> None:
         """Learns what a place is."""
@@ -179,19 +205,20 @@ class Search:
         Raises:
           UserError: whatever hinders a bake or a fit.
         """
-        setting = self._setting(Plan(place, max(BASES), "float"))
+        setting = self.setting(Plan(place, max(BASES), "float"))
         data, baked = self.workshop.bake(setting)
         model, fitted = self._fit(setting, data)
         most = model.relighter.report.bases
         sizes = [count for count in _SCORED if count in self.bases and count < most] + [most]
         shorter = [first_bases(model, count) for count in sizes]
-        tallies = [self.workshop.yardstick.tally(stored(without_last(model, most - count), "half")) for count in sizes]
+        errors, spread, skew = self._curve(model, sizes)
         values = data.values(data.split("train")[:1], model.points, model.quantity)[0]
         trial = Trial(
             place,
             tuple(sizes),
-            tuple(map(_error, tallies)),
-            spread_of(tallies[-1]),
+            errors,
+            spread,
+            skew,
             tuple(_frame_us(one, values) for one in shorter),
             {name: tuple(shipped_bytes(one, name) / 1e6 for one in shorter) for name in _PRECISIONS},
             baked["seconds"],
@@ -201,16 +228,29 @@ class Search:
         append_line(self.workshop.folder / "trials.jsonl", json.dumps(record, allow_nan=False))
         return trial
 
+    def _curve(self, model: Model, sizes: Sequence[int]) -> tuple[tuple[float, ...], float, float]:
+        """Errors at so many bases, and how sure that of the most is."""
+        most = model.relighter.report.bases
+        tallies = [self.held_out.tally(stored(without_last(model, most - count), "half")) for count in sizes]
+        return tuple(map(error_of, tallies)), *spread_of(tallies[-1])
+
+    def _scored_again(self, trial: Trial) -> Trial:
+        """The same with its errors on all held-out lightings there are now."""
+        setting = self.setting(Plan(trial.place, max(BASES), "float"))
+        data, _ = self.workshop.bake(setting)
+        errors, spread, skew = self._curve(self._fit(setting, data)[0], trial.bases)
+        return replace(trial, errors=errors, error_spread=spread, error_skew=skew)
+
     def _verify(self, plan: Plan) -> dict[str, float]:
         """The plan itself, fitted and scored; the trial of its place takes over what differs from its curves."""
-        setting = self._setting(plan)
+        setting = self.setting(plan)
         data, baked = self.workshop.bake(setting)
         model, fitted = self._fit(setting, data)
         model = stored(model, plan.precision)
         values = data.values(data.split("train")[:1], model.points, model.quantity)[0]
-        tally = self.workshop.yardstick.tally(model)
+        tally = self.held_out.tally(model)
         reached = {
-            "relative_rmse": _error(tally),
+            "relative_rmse": error_of(tally),
             "frame_us": _frame_us(model, values),
             "megabytes": shipped_bytes(model, plan.precision) / 1e6,
             "bake_seconds": float(baked["seconds"]),
@@ -218,14 +258,15 @@ class Search:
         }
         known = next(trial for trial in reversed(self.planner.trials) if trial.place == plan.place)
         self.planner.trials.remove(known)
-        self.planner.add(with_measured(known, plan, reached, spread_of(tally)))
+        self.planner.add(with_measured(known, plan, reached, *spread_of(tally)))
         return reached
 
     def _fit(self, setting: Setting, data: Dataset) -> tuple[Model, float]:
         model, timing = timed(lambda: fit_config(data, setting.config, "svd-ridge"), 1)
         return model, timing.median
 
-    def _setting(self, plan: Plan) -> Setting:
+    def setting(self, plan: Plan) -> Setting:
+        """A plan as a configuration."""
         changes: dict[str, Any] = {
             knob: value if knob == "transport.target_noise" else round(value)
             for knob, value, base in zip(KNOBS, plan.place, self.base, strict=True)
@@ -291,18 +332,7 @@ def without_last(model: Model, count: int) -> Model:
     return replace(model, relighter=linear.truncated(len(linear.basis) - count))
 
 
-def spread_of(tally: Tally) -> float:
-    """Standard error of the logarithm of the relative RMSE over held-out lightings, by leaving each out (the jackknife)."""
-    count = len(tally.error)
-    if count < 2 or not tally.error.any():
-        return 1.0
-    means = tally.mean.mean(1)
-    others = (tally.error.sum() - tally.error) / (count - 1), (means.sum() - means) / (count - 1)
-    logs = 0.5 * np.log(np.maximum(others[0], 1e-300)) - np.log(np.maximum(others[1], 1e-300))
-    return float(np.sqrt((count - 1) / count * np.sum((logs - logs.mean()) ** 2)))
-
-
-def with_measured(trial: Trial, plan: Plan, reached: dict[str, float], spread: float) -> Trial:
+def with_measured(trial: Trial, plan: Plan, reached: dict[str, float], spread: float, skew: float) -> Trial:
     """A trial with one more number of bases on its curves, or with another value there."""
     rows = {
         bases: (error, frame, {name: sizes[i] for name, sizes in trial.megabytes.items()})
@@ -316,6 +346,7 @@ def with_measured(trial: Trial, plan: Plan, reached: dict[str, float], spread: f
         bases=tuple(order),
         errors=tuple(rows[bases][0] for bases in order),
         error_spread=spread,
+        error_skew=skew,
         frame_us=tuple(rows[bases][1] for bases in order),
         megabytes={name: tuple(rows[bases][2][name] for bases in order) for name in trial.megabytes},
         fit_seconds=reached["fit_seconds"],
@@ -328,7 +359,7 @@ def told(outcome: Outcome) -> str:
     for name in QUANTITIES:
         limit = f"{outcome.limits[name]:.4g}{UNITS[name]}" if name in outcome.limits else "-"
         lines.append(f"{name:<16}{f'{outcome.reached[name]:.4g}{UNITS[name]}':>12}{limit:>12}")
-    setting = f"{outcome.setting.name}, after {outcome.trials} bakes"
+    setting = f"{outcome.setting.name}, after {outcome.trials} bakes, on {outcome.held_out} held-out lightings"
     if outcome.met:
         lines.append(f"meets the budget: {setting}; the least room is left by {outcome.binding}")
         if outcome.chance < _SURE:
@@ -356,13 +387,6 @@ def _around(config: Config, knob: str, base: float, factors: Sequence[float]) ->
     if knob == "atlas.resolution":
         return tuple(sorted({base, *(step for each in steps if (step := float(8 * round(each / 8))) < base)}))
     return tuple(sorted({base, *(float(round(step)) for step in steps)}))
-
-
-def _error(tally: Tally) -> float:
-    error = tally.scores()["relative_rmse"]
-    if error is None:
-        raise UserError("tune: got held-out lightings without indirect light, expected some; there is nothing to learn")
-    return float(error)
 
 
 def _frame_us(model: Model, values: np.ndarray) -> float:

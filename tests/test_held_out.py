@@ -1,0 +1,106 @@
+"""Held-out lightings that a search draws when those of the configuration do not tell: on real small bakes."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from small_job import base
+
+from ddprt.bench.measure.settings import Setting
+from ddprt.bench.measure.trial import Workshop
+from ddprt.bench.tune.held_out import HeldOut, error_of, spread_of
+from ddprt.bench.tune.planner import Plan, Planner
+from ddprt.bench.tune.search import Search
+from ddprt.lights import lighting_json
+from ddprt.progress import Progress
+from ddprt.runtime.train import fit_config
+
+QUIET = Progress(quiet=True)
+
+
+@pytest.fixture(scope="module")
+def workshop(tmp_path_factory: pytest.TempPathFactory) -> Workshop:
+    return Workshop(base(), tmp_path_factory.mktemp("held-out"), QUIET)
+
+
+def drawn(held_out: HeldOut) -> list[str]:
+    yardsticks = held_out.workshop.yardstick, *held_out._more
+    return [repr(each.data.lightings[index]) for each in yardsticks for index in each.held_out]
+
+
+def test_each_time_there_are_twice_as_many_and_all_differ(workshop: Workshop) -> None:
+    held_out = HeldOut(workshop)
+    assert held_out.count == 4
+    first = drawn(held_out)
+    assert held_out.more(0.5, 0.0), "the first doubling is never too dear"
+    assert not held_out.more(0.5, 0.0), "the second is"
+    assert held_out.count == 8
+    assert held_out.more(0.5, 1e9)
+    assert held_out.count == 16
+    assert len({*drawn(held_out)}) == 16
+    assert drawn(held_out)[:4] == first
+    again = HeldOut(workshop)
+    assert again.more(0.5, 0.0)
+    assert drawn(again) == drawn(held_out)[:8]
+    assert 0 < again.seconds < held_out.seconds, "what lay there is told as it was baked"
+    took = json.loads(next(workshop.folder.glob("truth-*-4-*/took.json")).read_text())
+    assert again.seconds == took["seconds"]
+
+
+def test_their_maps_are_as_fine_as_a_tenth_of_the_limit_asks(workshop: Workshop) -> None:
+    for limit, noise in ((0.5, 0.3), (4.0, 0.4), (100.0, 1.0)):  # the configuration's is 0.3
+        held_out = HeldOut(workshop)
+        assert held_out.more(limit, 0.0)
+        settings = held_out._more[0].data.description["transport"]
+        assert settings["target_noise"] == noise
+
+
+def test_errors_are_pooled_over_all_of_them(workshop: Workshop) -> None:
+    model = fit_config(workshop.bake(Setting({}, base()))[0], base(), "svd-ridge")
+    held_out = HeldOut(workshop)
+    few = held_out.tally(model)
+    held_out.more(0.5, 0.0)
+    tally = held_out.tally(model)
+    assert np.array_equal(tally.error[:4], few.error)
+    assert len(tally.error) == 8
+    other = held_out._more[0].tally(model)
+    pooled = np.sqrt((few.error.sum() + other.error.sum()) / 8) / ((few.mean.sum() + other.mean.sum()) / 24)
+    assert error_of(tally) == pytest.approx(float(pooled), rel=1e-12)
+    assert spread_of(tally) != spread_of(few)
+
+
+def test_a_file_has_no_others(workshop: Workshop, tmp_path: Path) -> None:
+    listed = tmp_path / "lamps.json"
+    data, _ = workshop.bake(Setting({}, base()))
+    listed.write_text(json.dumps([lighting_json(lighting) for lighting in data.lightings]))
+    counts = {f"lightings__{split}": len(data.split(split)) for split in ("train", "validation", "test")}
+    shop = Workshop(base(lightings__file=str(listed), **counts), tmp_path, QUIET)
+    assert not HeldOut(shop).more(0.5, 1e9)
+
+
+def test_what_was_tried_is_scored_on_all_before_another_bake(workshop: Workshop, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A limit just below the error that few lightings tell: they are doubled until it is decided, or another setting is."""
+    model = fit_config(workshop.bake(Setting({}, base()))[0], base(fit__bases=128), "svd-ridge")
+    told = error_of(workshop.yardstick.tally(model))
+    search = Search(base(tune__max_relative_rmse=0.97 * told, tune__trials=1), workshop)
+    seen: list[Any] = []
+    before = Planner.replace
+
+    def note(planner: Planner, trial: Any) -> None:
+        seen.append(trial)
+        before(planner, trial)
+
+    monkeypatch.setattr(Planner, "replace", note)
+    monkeypatch.setattr(Planner, "undecided", lambda planner, plan: not seen and isinstance(plan, Plan))
+    outcome = search.run()
+    assert outcome.held_out == search.held_out.count == 8
+    (trial,) = seen
+    model = fit_config(workshop.bake(Setting({}, base()))[0], base(fit__bases=trial.bases[-1]), "svd-ridge")
+    # Stored as halves, which a trial's errors are of: a basis is rounded by a share of 2**-11, its light by no more.
+    assert trial.errors[-1] == pytest.approx(error_of(search.held_out.tally(model)), abs=2 * 2**-11)
+    assert trial.error_spread == pytest.approx(spread_of(search.held_out.tally(model))[0], rel=0.02)
+    assert len(search.planner.trials) == 1
+    monkeypatch.undo()
+    assert search.planner.trials[0].errors[-1] == pytest.approx(trial.errors[-1], abs=1e-3)
