@@ -33,10 +33,10 @@ class Autoencoder(Learned):
     by: Literal["adam", "l-bfgs"] = "l-bfgs"
 
     def fit(self, train: Examples, validation: Examples, *, key: Array) -> LinearTransfer:
-        """See `Method`; the subspace that was best on `validation` is kept."""
+        """See `Method`; like the SVD it looks at the training light alone, as `validation` would choose another subspace."""
         entries = jnp.asarray(entry_weights(train.area, train.weights, train.channels))  # type: ignore[arg-type]
-        seen, held = (_light(part, entries) for part in (train, validation))
-        trained = self.trained("autoencoder", Subspace(min(self.bases, len(entries))), seen, held, key)
+        light = _light(train, entries)
+        trained = self.trained("autoencoder", Subspace(min(self.bases, len(entries))), light, light, key)
         basis = _basis(trained.parameters, _rows(train), entries, self.bases)
         relighter = transfer_to(basis, train, self.ridge)
         report = relighter.report.noting(*statuses(trained))
@@ -58,17 +58,19 @@ class Subspace:
 
     def initial(self, data: Light, key: Array) -> Float[Array, "entries bases"]:
         """Random directions."""
-        return jax.random.normal(key, (data.rows.shape[1], self.bases)) / jnp.sqrt(data.rows.shape[1])
+        return jnp.linalg.qr(jax.random.normal(key, (data.rows.shape[1], self.bases)))[0]
 
     def loss(self, parameters: Float[Array, "entries bases"], data: Light, key: Array) -> Float[Array, ""]:
-        """Of all rows at once."""
-        return self.check(parameters, data)
+        """Of all rows at once; and a pull towards orthonormal columns, which costs nothing and keeps rounding at bay."""
+        W = parameters.astype(jnp.float32)
+        skew = jnp.matmul(W.T, W, precision="highest") - jnp.eye(self.bases)
+        return self.check(parameters, data) + jnp.sum(skew**2)
 
     def check(self, parameters: Float[Array, "entries bases"], held: Light) -> Float[Array, ""]:
         """Share of the rows' squares outside of the subspace; summed there, as 1 less the share inside has no digits."""
         Q = jnp.linalg.qr(parameters.astype(jnp.float32))[0]
         outside = held.rows - jnp.matmul(jnp.matmul(held.rows, Q, precision="highest"), Q.T, precision="highest")
-        return jnp.sum(outside**2) / held.squares
+        return jnp.log(jnp.maximum(jnp.sum(outside**2) / held.squares, 1e-12))
 
 
 def _rows(examples: Examples) -> Float[Array, "columns entries"]:
