@@ -41,6 +41,8 @@ def test_each_time_there_are_twice_as_many_and_all_differ(workshop: Workshop) ->
     assert held_out.count == 16
     assert len({*drawn(held_out)}) == 16
     assert drawn(held_out)[:4] == first
+    assert held_out.more(0.5, 1e9, 4)
+    assert held_out.count == 64
     again = HeldOut(workshop)
     assert again.more(0.5, 0.0)
     assert drawn(again) == drawn(held_out)[:8]
