@@ -97,7 +97,7 @@ def test_what_was_tried_is_scored_on_all_before_another_bake(workshop: Workshop,
     monkeypatch.setattr(Planner, "replace", note)
     monkeypatch.setattr(Planner, "undecided", lambda planner, plan: not seen and isinstance(plan, Plan))
     outcome = search.run()
-    assert outcome.held_out == search.held_out.count == 8
+    assert outcome.held_out == search.held_out.count == 16, "so near, twice as many are not likely to tell"
     (trial,) = seen
     model = fit_config(workshop.bake(Setting({}, base()))[0], base(fit__bases=trial.bases[-1]), "svd-ridge")
     # Stored as halves, which a trial's errors are of: a basis is rounded by a share of 2**-11, its light by no more.
