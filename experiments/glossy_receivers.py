@@ -34,8 +34,11 @@ from ddprt.scene.library import build
 from ddprt.scene.material import Gloss
 from ddprt.scene.mesh import Scene
 from ddprt.transport import exitant
+from ddprt.transport.direct import Texels
 from ddprt.transport.effects import force
 from ddprt.transport.embree import Tracer
+from ddprt.transport.paths import trace_paths
+from ddprt.transport.reflected import Lit
 
 ROUGHNESS = (0.15, 0.25, 0.35, 0.45, 0.6, 0.8, 1.0)
 SHOWN, WIDE = (0, 2, 4, 6, 8, 12), 16
@@ -61,8 +64,11 @@ def coated(scene: Scene, part: Gloss, name: str = "gilt") -> Scene:
 def projection(roughness: float) -> list[float]:
     """Relative RMSE that each order leaves, of a metal vase under three lamps."""
     scene = coated(build("glossy-room"), Gloss(roughness, 1.0))
-    tracer, atlas = Tracer.of(scene), build_atlas(scene, 32)
-    lit = exitant.Lit.of(tracer, scene, LAMPS)
+    tracer, atlas, fine = Tracer.of(scene), build_atlas(scene, 32), build_atlas(scene, 128)
+    texels, light = Texels.of(tracer, fine, 4, np.random.default_rng(0)), np.zeros((len(LAMPS), fine.count, 3), np.float32)
+    list(trace_paths(tracer, scene, fine, LAMPS, light, samples=64, seed=0, stream="shown"))
+    light += np.stack([texels.irradiance(lamp, np.random.default_rng(1)) for lamp in LAMPS])
+    lit = Lit.of(tracer, scene, fine, LAMPS, np.ascontiguousarray(light.transpose(1, 2, 0)))
     exits = exitant.Exits.of(scene, atlas, exitant.order_for(roughness))
     wide, runs = replace(exits, order=WIDE), []
     for run in range(2):

@@ -13,9 +13,9 @@ import pytest
 from scipy.special import j0
 
 import ddprt
-from ddprt import warp
+from ddprt import seeds, warp
 from ddprt.config import Config, checked
-from ddprt.dataset.gloss import GlossBake, gloss_layers
+from ddprt.dataset.gloss import gloss_layers
 from ddprt.dataset.layers import layers, read_layer, read_light
 from ddprt.dataset.manifest import Manifest, layer_name
 from ddprt.dataset.store import Dataset
@@ -26,16 +26,18 @@ from ddprt.progress import Progress
 from ddprt.report.layers import layer_scores
 from ddprt.scene.atlas import Atlas, build_atlas
 from ddprt.scene.library import build
-from ddprt.scene.material import Gloss, Material
+from ddprt.scene.material import Emission, Gloss, Material
 from ddprt.scene.mesh import Scene
-from ddprt.scene.shapes import box, faceted, hollow
+from ddprt.scene.shapes import box, faceted, hollow, rectangle
 from ddprt.transport import exitant, ggx
+from ddprt.transport.direct import Texels
 from ddprt.transport.effects import force
 from ddprt.transport.embree import Tracer, lifted
-from ddprt.transport.exitant import Exits, Lit, order_for, trace_exitant
+from ddprt.transport.exitant import Exits, order_for, trace_exitant
 from ddprt.transport.gloss import Surfaces, scattering
 from ddprt.transport.openness import build_open_atlas
 from ddprt.transport.paths import trace_paths
+from ddprt.transport.reflected import Arriving, Lit
 
 LAMP = parse_lighting({"type": "point", "position": [0.28, 0.45, 0.28], "intensity": [1, 1, 1]})
 OTHER = parse_lighting({"type": "point", "position": [0.45, 0.4, 0.1], "intensity": [0.5, 0.2, 0.8]})
@@ -53,13 +55,30 @@ def vase(part: Gloss, albedo: tuple[float, float, float] = (0.9, 0.65, 0.3)) -> 
     return force(room, on=["gloss"])
 
 
+def direct(scene: Scene, atlas: Atlas, lightings: list[Lighting]) -> np.ndarray:
+    """(texels, 3, lightings): light that comes straight from lamps."""
+    texels = Texels.of(Tracer.of(scene, 2), atlas, 16, np.random.default_rng(0))
+    return np.stack([texels.irradiance(lighting, np.random.default_rng(1)) for lighting in lightings], 2)
+
+
 def sent(
-    scene: Scene, atlas: Atlas, lightings: list[Lighting], samples: int, *, bounces: int = -1, threads: int = 2, **settings: Any
+    scene: Scene,
+    atlas: Atlas,
+    lightings: list[Lighting],
+    samples: int,
+    *,
+    threads: int = 2,
+    shown: tuple[Atlas, np.ndarray] | None = None,
+    **settings: Any,
 ) -> tuple[Exits, np.ndarray]:
-    """Places of the only order of a scene, and their coefficients (lightings, places, harmonics, rgb)."""
+    """Places of the only order of a scene, and their coefficients (lightings, places, harmonics, rgb).
+
+    What is seen in them is direct light, or what an atlas of its own shows.
+    """
     tracer = Tracer.of(scene, threads)
     ((order, _),) = exitant.orders(scene).items()
-    exits, lit = Exits.of(scene, atlas, order), Lit.of(tracer, scene, lightings, bounces)
+    exits = Exits.of(scene, atlas, order)
+    lit = Lit.of(tracer, scene, shown[0] if shown else atlas, lightings, shown[1] if shown else direct(scene, atlas, lightings))
     chosen = settings.pop("chosen", np.arange(exits.count))
     out = np.full((len(lightings), len(chosen) * count(order), 3), np.nan, np.float32)
     settings = {"seed": 0, "stream": "test", **settings}
@@ -84,10 +103,9 @@ def atlas(room: Scene) -> Atlas:
 def test_in_a_furnace_a_surface_sends_out_its_albedo(part: Gloss, atlas: Atlas, monkeypatch: pytest.MonkeyPatch) -> None:
     """Light of radiance 1 from everywhere: L(o) is the directional albedo, whose harmonics quadrature gives."""
 
-    def white(self: Lit, origins: np.ndarray, directions: np.ndarray, alive: np.ndarray, *streams: Any) -> np.ndarray:
-        light = np.zeros((1, len(origins), 3))
-        light[:, alive] = 1
-        return light
+    def white(self: Lit, origins: np.ndarray, directions: np.ndarray, alive: np.ndarray, *streams: Any) -> Iterator[Arriving]:
+        table, factor = np.ones((1, 3, 1), np.float32), np.ones((len(alive), 3), np.float32)
+        yield Arriving(alive.astype(np.int32), np.zeros(len(alive), np.int32), factor, table)
 
     monkeypatch.setattr(Lit, "arriving", white)
     scene = vase(part)
@@ -135,7 +153,8 @@ def test_a_rough_dielectric_sends_out_what_a_white_wall_would(atlas: Atlas) -> N
     scene, albedo = vase(Gloss(1.0, 0.0, 0.0), (0.8, 0.8, 0.8)), 0.8
     tracer, out = Tracer.of(scene, 2), np.zeros((2, atlas.count, 3), np.float32)
     list(trace_paths(tracer, scene, atlas, [LAMP, PANEL], out, samples=256, seed=0, stream="wall"))
-    exits, found = sent(scene, atlas, [LAMP, PANEL], 256)
+    shown = direct(scene, atlas, [LAMP, PANEL]) + out.transpose(1, 2, 0)
+    exits, found = sent(scene, atlas, [LAMP, PANEL], 256, shown=(atlas, shown))
     share = exits.weight / exits.weight.sum()
     whole = exits.weight > 0.99 * atlas.area[exits.texel]
     assert whole.mean() > 0.8
@@ -150,9 +169,12 @@ def test_a_rough_dielectric_sends_out_what_a_white_wall_would(atlas: Atlas) -> N
 
 
 def twin(
-    scene: Scene, exits: Exits, place: int, outgoing: np.ndarray, lamp: Lighting, bounces: int, seed: int
+    scene: Scene, exits: Exits, place: int, outgoing: np.ndarray, lamp: Lighting, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Radiance from anywhere on a place towards each direction of its frame, and these frames: one path each, no roulette."""
+    """Radiance from anywhere on a place towards each direction of its frame, and these frames.
+
+    One path each, without roulette, that ends on what is diffuse and finds direct light there and on what glosses before.
+    """
     tracer, rng = Tracer.of(scene, 1), np.random.default_rng(seed)
     surfaces, (light,), n = Surfaces.of(tracer, scene), lamp, len(outgoing)
     at, power = (np.array(light.position) - tracer.centre), np.array(light.intensity)  # type: ignore[attr-defined]
@@ -162,7 +184,7 @@ def twin(
     frames = tracer.frames[triangle]
     away = -np.einsum("nj,nji->ni", outgoing, frames)
     throughput, total, alive = np.ones((n, 3)), np.zeros((n, 3)), np.ones(n, bool)
-    for depth in range(bounces + 1):
+    for depth in range(12):  # of the gold of two more meetings than that, less than 1e-4 is left
         shiny = surfaces.shiny[triangle]
         normal, lobes = tracer.normals[triangle], surfaces.lobes(triangle, u, v, away.astype(np.float32))
         origin = lifted(tracer, position, normal)
@@ -180,25 +202,30 @@ def twin(
         away = np.where(shiny[:, None], incoming, diffuse).astype(np.float32)
         throughput = throughput * np.where(shiny[:, None], weight, albedo)
         hits = tracer.closest(origin, away)
-        alive = alive & hits.front
+        alive = alive & hits.front & shiny
         triangle, u, v = np.maximum(hits.triangle, 0), hits.u, hits.v
         position = tracer.on_triangle(triangle, u, v)
     return total, frames
 
 
 def test_a_slow_twin_agrees(room: Scene, atlas: Atlas) -> None:
-    """All coefficients of a few texels against independent paths towards random directions, after up to four bounces."""
-    rng, paths, bounces, runs = np.random.default_rng(0), 1 << 16, 4, 32
+    """All coefficients of a few texels against independent paths towards random directions; the room shows its direct light.
+
+    What the paths find at a point is met by an atlas of 6 mm a texel.
+    """
+    rng, paths, runs = np.random.default_rng(0), 1 << 16, 32
+    fine = build_atlas(room, 256)
+    shown = fine, direct(room, fine, [LAMP])
     places = np.array([5, 14, 23, 38])
     ours = []
     for k in range(runs):
-        exits, found = sent(room, atlas, [LAMP], 128, bounces=bounces, stream=f"{k}", chosen=places)
+        exits, found = sent(room, atlas, [LAMP], 128, shown=shown, stream=f"{k}", chosen=places)
         ours.append(found[0, :, :, GREEN].astype(float))
     mean, spread = np.mean(ours, 0), np.var(ours, 0, ddof=1) / runs
     scores = np.empty(mean.shape)
     for row, place in enumerate(places):
         outgoing = warp.sample_cone(rng.random((paths, 2), np.float32), 1.0)
-        light, frames = twin(room, exits, int(place), outgoing, LAMP, bounces, int(place))
+        light, frames = twin(room, exits, int(place), outgoing, LAMP, int(place))
         Y = sum(harmonics(np.einsum("nj,nji->ni", outgoing * [1, 1, side], frames), exits.order) for side in (1, -1))
         theirs = 2 * np.pi * Y * light[:, GREEN, None]
         scores[row] = (mean[row] - theirs.mean(0)) / np.sqrt(spread[row] + theirs.var(0) / paths)
@@ -270,14 +297,16 @@ def test_each_material_pays_for_its_own_order(room: Scene) -> None:
     material = room.material.copy()
     material[half] = len(room.materials)
     mixed = replace(room, material=material, materials=(*room.materials, smooth))
-    assert gloss_layers(mixed) == [{"name": f"gloss-{order}", "quantity": "radiance", "order": order} for order in (4, 8)]
+    assert gloss_layers(job(), mixed) == [
+        {"name": f"gloss-{order}", "quantity": "radiance", "order": order} for order in (4, 8)
+    ]
     atlas = build_atlas(mixed, 32)
     for order, index in ((4, 3), (8, 4)):
         exits = Exits.of(mixed, atlas, order)
         assert exits.sampler is not None
         assert (mixed.material[exits.sampler.triangle] == index).all()
         np.testing.assert_allclose(exits.weight.sum(), mixed.areas[material == index].sum(), rtol=1e-6)
-    assert not set(gloss_layers(build("cornell"))[:1])
+    assert gloss_layers(job(), build("cornell")) == []
 
 
 # --- in a bake --------------------------------------------------------------------------------------------------------
@@ -315,11 +344,12 @@ def test_a_layer_of_glossy_texels(data: Dataset, room: Scene, progress: Progress
     np.testing.assert_allclose(position, layer.position, atol=1e-6)
     np.testing.assert_allclose(layer.weight.sum(), room.areas[room.material == 3].sum(), rtol=0.05)  # but what nobody sees
     train, test = ([s for s in progress.stages if s["name"] == f"gloss {split}, order 4"] for split in ("train", "test"))
-    assert (train[0]["samples"], test[0]["samples"]) == (16, 64)
-    # Each path has a ray at least, unless its facet reflects below the surface, and no more than follow it and light it.
-    for (stage,), lightings in ((train, 8), (test, 2)):
-        paths = int(stage["samples"]) * len(layer.texel)
-        assert 0.8 * paths < int(stage["rays"]) < (6 + 6 * lightings) * paths
+    assert (train[0]["samples"], test[0]["samples"]) == (8 * 16, 8 * 64)
+    # A ray each, unless its facet reflects below the surface; where that meets gold, one that goes on, and one to each lamp.
+    # Held-out light also has direct light of its own: four samples of each texel, and up to twice as many again near lamps.
+    for (stage,), lightings, more in ((train, 8, 0), (test, 2, 3 * 2 * 4 * len(data.area))):
+        rays = int(stage["samples"]) * len(layer.texel)
+        assert 0.8 * rays < int(stage["rays"]) < (1.3 + 0.3 * lightings) * rays + more
     light = read_light(data, layer, data.split("test"))
     up = layer.towards(light, data.gbuffer["geometric_normal"][layer.texel])
     assert (up > 0).mean() > 0.9
@@ -328,21 +358,31 @@ def test_a_layer_of_glossy_texels(data: Dataset, room: Scene, progress: Progress
 
 
 def test_held_out_light_is_the_mean_of_its_halves(data: Dataset, room: Scene) -> None:
+    """Each half shows its own direct light and its own half of the indirect light."""
     layer, test = read_layer(data, "gloss-4"), data.split("test")
-    atlas, _ = build_open_atlas(Tracer.of(room, 1), scattering(room), 32, job().atlas.padding)
+    tracer = Tracer.of(room, 1)
+    atlas, _ = build_open_atlas(tracer, scattering(room), 32, job().atlas.padding)
     lightings = [data.lightings[index] for index in test]
-    halves = [sent(room, atlas, lightings, 32, stream=f"gloss-4 test-{half}")[1] for half in (0, 1)]
+    texels = Texels.of(tracer, atlas, job().transport.direct_samples, seeds.stream(0, "texel positions", 1))
+    again = [texels.irradiance(data.lightings[index], seeds.stream(0, "direct", index, 1)) for index in test]
+    halves = []
+    for half, straight in enumerate((data.maps("direct", test), np.array(again))):
+        light = straight + data.maps("indirect", test)
+        light = light - data.maps("noise", test) if half else light + data.maps("noise", test)
+        shown = atlas, np.ascontiguousarray(light.transpose(1, 2, 0))
+        halves.append(sent(room, atlas, lightings, 8 * 32, stream=f"gloss-4 test-{half}", shown=shown)[1])
     np.testing.assert_array_equal(read_light(data, layer, test), (halves[0] + halves[1]) / 2)
     np.testing.assert_array_equal(read_light(data, layer, test, "noise"), (halves[0] - halves[1]) / 2)
 
 
-def test_lightmaps_keep_their_bits(data: Dataset, room: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All but the layer is what it would be without it."""
-    monkeypatch.setattr(GlossBake, "all", classmethod(lambda cls, *args, **settings: ()))
-    with pytest.raises(UserError, match="files missing"):
+def test_lightmaps_keep_their_bits(data: Dataset, room: Scene, tmp_path: Path) -> None:
+    """All but the layer is what it would be without it; and without it is another dataset."""
+    bare = {**job().model_dump(), "effects": {"glossy_layers": False}}
+    plain = ddprt.bake(room, config=checked(bare), out=tmp_path / "bare")
+    assert sums(plain) == {name: digest for name, digest in sums(data).items() if not name.startswith("gloss-")}
+    assert layers(plain) == []
+    with pytest.raises(UserError, match=r"holds another dataset .*layers"):
         ddprt.bake(room, config=job(), out=tmp_path / "bare")
-    bare = {name: entry["sha256"] for name, entry in Manifest(tmp_path / "bare").entries.items()}
-    assert bare == {name: digest for name, digest in sums(data).items() if not name.startswith("gloss-")}
 
 
 def test_without_gloss_nothing_is_imported() -> None:
@@ -386,8 +426,9 @@ def test_a_bake_that_was_stopped_goes_on(
     assert sums(again) == sums(data)
     assert not list((tmp_path / "d").glob("*.part"))
     (name,) = (str(stage["name"]) for stage in shown.stages if str(stage["name"]).startswith("gloss"))
-    rays = [next(int(s["rays"]) for s in one.stages if s["name"] == name) for one in (shown, progress)]
-    assert 0.4 * rays[1] < rays[0] < 0.6 * rays[1]
+    after, whole = (next(stage for stage in one.stages if stage["name"] == name) for one in (shown, progress))
+    half = int(whole["samples"]) * len(read_layer(again, "gloss-4").texel) / 2
+    assert 0.8 * half < int(whole["rays"]) - int(after["rays"]) < 1.9 * half  # what the first half took, as above
     shutil.copytree(again.folder, tmp_path / "cut")
     lost = layer_name("gloss-4", 3)
     (tmp_path / "cut" / lost).unlink()
@@ -428,6 +469,52 @@ def test_paths_follow_the_noise_that_is_aimed_at(tmp_path: Path) -> None:
     # More paths are spread better than those of the pilot, so that less noise is left; texels differ in their tails.
     assert measured < 1.5 * float(stage["noise_expected"])
     assert measured > 0.2 * float(stage["noise_expected"])
+
+
+def test_what_glows_is_seen(tmp_path: Path) -> None:
+    """A metal floor that shows a glowing ceiling of radiance L through a third of its hemisphere, against quadrature.
+
+    Nothing else is there, so that all the light comes straight from what glows; and a model gives it back with the lamps off.
+    """
+    floor = Material("floor", (0.9, 0.6, 0.3), gloss=Gloss(0.6, 1.0))
+    panel = Material("panel", (0.0,) * 3, emission=Emission((3.0, 2.0, 1.0)))
+    half, height = 2.0, 1.0
+    quads = [rectangle((-0.05,) * 2, (0.05,) * 2, 0.0, 1, facing=1), rectangle((-half,) * 2, (half,) * 2, height, 1, facing=-1)]
+    scene = faceted("lit floor", np.array(quads), (floor, panel), np.array([0, 1]))
+    config = checked(
+        {
+            "atlas": {"resolution": 24},
+            "lightings": {
+                "train": 4,
+                "validation": 2,
+                "test": 2,
+                "region_low": [0.4, 0.3, 0.4],
+                "region_high": [0.6, 0.6, 0.6],
+            },
+            "points": {"count": 8, "supersample": 1},
+            "transport": {"samples": 64, "test_samples": 512},
+        }
+    )
+    data = ddprt.bake(scene, config=config, out=tmp_path / "d")
+    (layer,) = layers(data)
+    found = layer.towards(read_light(data, layer, ["constant"])[0], np.array([0.0, 1.0, 0.0]))
+    # Up, by the midpoint rule over the panel: f cos(i) L cos(at the panel) / d².
+    n = 400
+    x, z = ((np.arange(n) + 0.5) / n * 2 - 1) * half, ((np.arange(n) + 0.5) / n * 2 - 1) * half
+    to = np.stack(np.broadcast_arrays(x[:, None], z, height), -1).reshape(-1, 3)
+    far = np.linalg.norm(to, axis=1)
+    to /= far[:, None]
+    value = ggx.evaluate(
+        np.tile([0.0, 0.0, 1.0], (n * n, 1)), to, np.tile(floor.albedo, (n * n, 1)), np.tile([0.6, 1.0, 0.04], (n * n, 1))
+    )
+    exact = (value * (to[:, 2] / far**2)[:, None]).sum(0) * (2 * half / n) ** 2 * (3.0, 2.0, 1.0)
+    mean = (found * layer.weight[:, None]).sum(0) / layer.weight.sum()
+    # Order 4 leaves out 5 % of the mean at this roughness (docs/effects.md).
+    np.testing.assert_allclose(mean, exact, rtol=0.08)
+    model = ddprt.fit(data, bases=2)
+    dark = np.zeros((model.points, 3))
+    np.testing.assert_allclose(model.layers[layer.name].towards(dark, (0.0, 1.0, 0.0)), found, rtol=1e-5)
+    assert (model.layers[layer.name].towards(dark, (0.0, 1.0, 0.0), constant=False) == 0).all()
 
 
 def test_no_bounces_no_light(room: Scene, tmp_path: Path) -> None:

@@ -13,9 +13,12 @@ from ddprt.lights import parse_lighting
 from ddprt.scene.library import build
 from ddprt.scene.material import Gloss, Material
 from ddprt.scene.mesh import Scene
+from ddprt.transport.direct import centred
 from ddprt.transport.effects import force
 from ddprt.transport.embree import Tracer, lifted
-from ddprt.transport.exitant import Lit
+from ddprt.transport.gloss import Surfaces
+from ddprt.transport.shading import shade, shift
+from ddprt.transport.walk import albedo_of, walked
 
 pytestmark = pytest.mark.slow
 
@@ -88,18 +91,24 @@ def on_metal(scene: Scene, rng: np.random.Generator) -> tuple[np.ndarray, np.nda
 
 
 def sent_out(scene: Scene, triangle: np.ndarray, weights: np.ndarray, towards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Indirect radiance of one channel that leaves places towards directions, and the variance of its mean."""
-    tracer = Tracer.of(scene, 2)
-    lit, found = Lit.of(tracer, scene, [parse_lighting(LIGHT)]), []
+    """Indirect radiance of one channel that leaves places towards directions, and the variance of its mean.
+
+    By whole paths: lightmaps, in which a layer of exitant light ends its rays, would add the blur of their texels.
+    """
+    tracer, lamp = Tracer.of(scene, 2), parse_lighting(LIGHT)
+    surfaces, lamps, found = Surfaces.of(tracer, scene), [[(light, shift(light)) for light in centred(tracer, lamp)]], []
     for point in range(len(triangle)):
         rng = seeds.stream(1, "mitsuba", point)
         face = np.full(SAMPLES, triangle[point], np.int32)
         u, v = (np.full(SAMPLES, weights[point, corner], np.float32) for corner in (1, 2))
-        lobes = lit.surfaces.lobes(face, u, v, np.tile(-towards[point].astype(np.float32), (SAMPLES, 1)))
+        lobes = surfaces.lobes(face, u, v, np.tile(-towards[point].astype(np.float32), (SAMPLES, 1)))
         incoming, weight = lobes.scattered(rng.random((SAMPLES, 3), np.float32))
-        origins = lifted(tracer, tracer.on_triangle(face, u, v), tracer.normals[face])
-        light = lit.arriving(origins, incoming, np.flatnonzero(weight[:, GREEN] > 0), rng, rng)[0, :, GREEN]
-        found.append(weight[:, GREEN] * light)
+        origins, alive = lifted(tracer, tracer.on_triangle(face, u, v), tracer.normals[face]), weight[:, GREEN] > 0
+        rays, sums = (origins[alive], incoming[alive], np.flatnonzero(alive).astype(np.int32)), np.zeros((1, SAMPLES, 3))
+        for met in walked(tracer, albedo_of(scene), rays, rng, -1, surfaces):
+            for part in met.blocks():
+                shade(tracer, lamps, part, rng, sums)
+        found.append(weight[:, GREEN] * sums[0, :, GREEN] / np.pi)
     return np.mean(found, 1), np.var(found, 1) / SAMPLES
 
 

@@ -64,7 +64,7 @@ class IndirectBake:
             dark = self.config.transport.bounces == 0 or not any(max(entry.albedo) for entry in self.scene.materials)
             self._probes.run(split, indices, sent, self.progress, dark=dark)
         for layer in self._glossy:
-            layer.run(split, indices, self.progress)
+            layer.run(split, indices, partial(self._shown, split, indices), self.progress)
 
     @cached_property
     def _probes(self) -> ProbeBake | None:
@@ -99,7 +99,8 @@ class IndirectBake:
         """Bakes the light of what glows, if a plan calls for it."""
         emission = self.effects.module("emission")
         probes = self._probes if self._probes and self._probes.lacks_constant() else None
-        if emission is None or (self.manifest.holds(CONSTANT) and probes is None):
+        glossy = [layer for layer in self._glossy if layer.lacks_constant()] if emission else []
+        if emission is None or (self.manifest.holds(CONSTANT) and probes is None and not glossy):
             return
         config, before = self.config.transport, self.tracer.rays
         with self.progress.stage("emission") as stage:
@@ -113,6 +114,8 @@ class IndirectBake:
             write_map(self.dataset.folder / CONSTANT, self.atlas.image(found.irradiance))
             self.manifest.add(CONSTANT)
             more = probes.constant(found.direct, self.atlas, self.scene, self.effects.bounces) if probes else {}
+            for layer in glossy:
+                layer.constant(found.irradiance)
             stage.facts |= found.facts | more | {"rays": self.tracer.rays - before}
 
     @cached_property
@@ -233,17 +236,31 @@ class IndirectBake:
         return {"bounces": bounced.bounces, "senders": operator.senders.count, "remainder": remainder}
 
     def _averaged(self, operator: Any, indices: Sequence[int], half: int) -> Float32[np.ndarray, "senders columns"]:
-        """Direct light of all lightings on the senders: as it was baked, or a second time for an independent half."""
+        """Direct light of all lightings on the senders."""
+        direct = self._direct(half)
+        return np.concatenate(list(self.tracer.map(lambda index: operator.averaged(direct(index)), indices)), 1)
+
+    def _direct(self, half: int) -> Callable[[int], Float32[np.ndarray, "texels 3"]]:
+        """Direct light of a lighting on the texels: as it was baked, or a second time for an independent half."""
         covered, seed, samples = self.dataset.covered, self.config.seed, self.config.transport.direct_samples
-        texels = Texels.of(self.tracer, self.atlas, samples, seeds.stream(seed, "texel positions", half)) if half else None
+        if half == 0:
+            return lambda index: read_map(self.dataset.folder / map_name("direct", index))[covered]
+        texels = Texels.of(self.tracer, self.atlas, samples, seeds.stream(seed, "texel positions", half))
+        return lambda index: texels.irradiance(self.dataset.lightings[index], seeds.stream(seed, "direct", index, half))
 
-        def work(index: int) -> np.ndarray:
-            if texels is None:
-                return operator.averaged(read_map(self.dataset.folder / map_name("direct", index))[covered])
-            rng = seeds.stream(seed, "direct", index, half)
-            return operator.averaged(texels.irradiance(self.dataset.lightings[index], rng))
+    def _shown(self, split: str, indices: Sequence[int], half: int) -> Float32[np.ndarray, "texels 3 lightings"]:
+        """All light on the texels, of a half where there are two."""
+        found, direct = np.empty((self.atlas.count, 3, len(indices)), np.float32), self._direct(half)
 
-        return np.concatenate(list(self.tracer.map(work, indices)), 1)
+        def work(row: int) -> None:
+            light, index = direct(indices[row]), indices[row]
+            for kind in ("indirect", "noise")[: 1 + (split == "test")]:
+                stored = read_map(self.dataset.folder / map_name(kind, index))[self.dataset.covered]
+                light = light - stored if kind == "noise" and half else light + stored
+            found[:, :, row] = light
+
+        list(self.tracer.map(work, range(len(indices))))
+        return found
 
     def _by_paths(self, split: str, indices: list[int], todo: list[int], kinds: list[str], stage: Stage) -> None:
         from ddprt.transport.paths import choose_samples, trace_paths

@@ -5,18 +5,21 @@ It lives on a hemisphere. Mirrored at the surface's plane it becomes a function 
 harmonics ring little; in the surface's own frame those with odd l + m vanish. Coefficients are c_k = integral over the
 hemisphere of (Y_k(o) + Y_k(mirrored o)) L(o): linear in light, so that basis and transfer hold for them as for texels.
 
-Each path is drawn for a direction o of its own, spread evenly over the hemisphere, and by the lobe about it; what it finds then
-counts for all directions of its group. With paths i_p that are drawn for o_p, the sum over p of
+What a surface shows is what is there to be seen: see `ddprt.transport.reflected`. What is blurred there by the width of a texel
+would be blurred by the harmonics all the more.
+
+Each ray is drawn for a direction o of its own, spread evenly over the hemisphere, and by the lobe about it; what it finds then
+counts for all directions of its group. With rays i_p that are drawn for o_p, the sum over p of
 
     L(i_p) * [sum over j of (Y_k(o_j) + ...) f(o_j, i_p) cos(i_p)] / [sum over j of pdf(i_p given o_j)]
 
 is what the balance heuristic (Veach and Guibas 1995) makes of as many techniques as there are directions, and so unbiased.
-Paths are what costs, and the rougher a surface, the more directions what a path found is good for.
+The rougher a surface, the more directions what a ray found is good for.
 
 How many harmonics a lobe needs follows from its width: see `order_for`.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,17 +29,14 @@ from scipy.special import k1
 from ddprt import harmonics, seeds, warp
 from ddprt.axes import Float32, Float64, Int, Int32
 from ddprt.compiled import compiled
-from ddprt.lights import Lighting
 from ddprt.scene.atlas import Atlas, SurfaceSampler, weights_at
 from ddprt.scene.material import Gloss
 from ddprt.scene.mesh import Scene
 from ddprt.transport import ggx
-from ddprt.transport.direct import centred
-from ddprt.transport.embree import Tracer, lifted
+from ddprt.transport.embree import lifted
 from ddprt.transport.gloss import Surfaces
 from ddprt.transport.glossiness import glossy, least_roughness
-from ddprt.transport.shading import Lamp, shade, shift
-from ddprt.transport.walk import Albedo, albedo_of, walked
+from ddprt.transport.reflected import Lit
 
 ORDERS = (2, 4, 6, 8)
 """Orders that layers have: few, so that surfaces of about equal roughness share one."""
@@ -44,10 +44,11 @@ ORDERS = (2, 4, 6, 8)
 KEPT = 0.2
 """Least attenuation of a harmonic that is worth keeping; see `order_for`."""
 
-_GROUP = 32  # paths that count for each other's directions
-_CALL = 1 << 12  # paths that are shaded together
-_PROBED, _PILOT = 128, 64  # texels, and paths of each in two independent runs, that predict how many are needed
-_LEAST, _MOST = 8, 8192  # paths per texel that "auto" may choose
+_GROUP = 32  # rays that count for each other's directions
+_CALL = 1 << 12  # rays that are traced together
+_PLACES = 16  # that are traced together: sums of all lightings take much room
+_PROBED, _PILOT = 128, 64  # texels, and rays of each in two independent runs, that predict how many are needed
+_LEAST, _MOST = 8, 8192  # rays per texel that "auto" may choose
 
 
 def order_for(roughness: float) -> int:
@@ -109,27 +110,27 @@ class Exits:
 
 @dataclass(frozen=True, eq=False)
 class Departures:
-    """Paths that leave glossy surfaces, and what each is drawn for.
+    """Rays that leave glossy surfaces, and what each is drawn for.
 
     Attributes:
-      origins: of rays, centred frame, metres.
+      origins: centred frame, metres.
       triangle: that each starts on.
-      outgoing, incoming: unit directions in the triangle's frame: where light is asked for, and where the path looks for it.
+      outgoing, incoming: unit directions in the triangle's frame: where light is asked for, and where the ray looks for it.
       base, gloss: of the surface there; see `ggx.evaluate`.
     """
 
-    origins: Float32[np.ndarray, "paths 3"]
-    triangle: Int32[np.ndarray, " paths"]
-    outgoing: Float32[np.ndarray, "paths 3"]
-    incoming: Float32[np.ndarray, "paths 3"]
-    base: Float32[np.ndarray, "paths 3"]
-    gloss: Float32[np.ndarray, "paths 3"]
+    origins: Float32[np.ndarray, "rays 3"]
+    triangle: Int32[np.ndarray, " rays"]
+    outgoing: Float32[np.ndarray, "rays 3"]
+    incoming: Float32[np.ndarray, "rays 3"]
+    base: Float32[np.ndarray, "rays 3"]
+    gloss: Float32[np.ndarray, "rays 3"]
 
     @classmethod
     def of(
-        cls, surfaces: Surfaces, sampler: SurfaceSampler, group: Int[np.ndarray, " paths"], u: Float32[np.ndarray, "paths 7"]
+        cls, surfaces: Surfaces, sampler: SurfaceSampler, group: Int[np.ndarray, " rays"], u: Float32[np.ndarray, "rays 7"]
     ) -> "Departures":
-        """One path of each group: two numbers for its place, two for where light goes, three for where it comes from."""
+        """One ray of each group: two numbers for its place, two for where light goes, three for where it comes from."""
         tracer = surfaces.tracer
         positions, triangle = sampler.sample(group, np.ascontiguousarray(u[:, :2]))
         weights = weights_at(tracer.corners[triangle].astype(np.float64), positions.astype(np.float64)).astype(np.float32)
@@ -138,50 +139,6 @@ class Departures:
         incoming, _ = ggx.sample(outgoing, np.ascontiguousarray(u[:, 4:]), base, gloss)
         origins = lifted(tracer, positions, tracer.normals[triangle]).astype(np.float32)
         return cls(origins, triangle, outgoing, incoming, base, gloss)
-
-
-@dataclass(frozen=True, eq=False)
-class Lit:
-    """A scene under lightings.
-
-    Attributes:
-      surfaces: its glossy triangles.
-      albedo, lamps: what `walked` and `shade` ask for.
-      bounces: -1 follows every path to its end.
-    """
-
-    surfaces: Surfaces
-    albedo: Albedo
-    lamps: Sequence[Sequence[Lamp]]
-    bounces: int
-
-    @classmethod
-    def of(cls, tracer: Tracer, scene: Scene, lightings: Sequence[Lighting], bounces: int = -1) -> "Lit":
-        """A scene and lightings in world space."""
-        lamps = [[(light, shift(light)) for light in centred(tracer, lighting)] for lighting in lightings]
-        return cls(Surfaces.of(tracer, scene), albedo_of(scene), lamps, bounces)
-
-    def arriving(
-        self,
-        origins: Float32[np.ndarray, "paths 3"],
-        directions: Float32[np.ndarray, "paths 3"],
-        alive: np.ndarray,
-        walk: np.random.Generator,
-        chance: np.random.Generator,
-    ) -> Float64[np.ndarray, "lightings paths 3"]:
-        """Radiance that one path each finds to arrive from directions, W/(m² sr); 0 for those that are not alive.
-
-        Args:
-          origins, directions: of rays; centred frame.
-          alive: indices of the paths that are followed.
-          walk, chance: random numbers of paths and of lights.
-        """
-        tracer, sums = self.surfaces.tracer, np.zeros((len(self.lamps), len(origins), 3))
-        rays = origins[alive], directions[alive], alive.astype(np.int32)
-        for met in walked(tracer, self.albedo, rays, walk, self.bounces, self.surfaces):
-            for part in met.blocks():
-                shade(tracer, self.lamps, part, chance, sums)
-        return sums / np.pi  # paths count irradiance of a plane that they are spread over by cosine
 
 
 def trace_exitant(
@@ -202,7 +159,7 @@ def trace_exitant(
     Args:
       lit, exits: the scene, its lightings, and the places.
       out: written in place, W/(m² sr), (order + 1)² entries for each place that is wanted; may lie on disk.
-      samples: paths per place.
+      samples: rays per place.
       seed, stream: address of the random numbers; another stream gives independent noise.
       skip: tiles that `out` holds already.
       chosen: the places that are wanted; None for all.
@@ -210,7 +167,7 @@ def trace_exitant(
       The number of places of each finished tile, in order, the skipped ones included.
     """
     places = np.arange(exits.count) if chosen is None else chosen
-    step = max(1, _CALL // samples)
+    step = max(1, min(_CALL // samples, _PLACES))
 
     def work(first: int) -> int:
         tile = places[first : first + step]
@@ -237,19 +194,18 @@ def _tile(
     directions = warp.to_world(paths.incoming, tracer.frames[paths.triangle])
     edges = np.append((samples * np.arange(len(tile))[:, None] + np.arange(0, samples, _GROUP)).ravel(), count)
     group = np.repeat(np.arange(len(edges) - 1), np.diff(edges))
-    Y = mirrored(paths.outgoing, exits.order) * (2 * np.pi / samples)  # uniform over the hemisphere
-    triangles, of_path = np.unique(paths.triangle, return_inverse=True)
-    turns = _turned(tracer.frames[triangles].astype(np.float64), exits.order)
-    sums = np.zeros((len(lit.lamps), len(tile), harmonics.count(exits.order), 3))
+    Y = (mirrored(paths.outgoing, exits.order) * (2 * np.pi / samples)).astype(np.float32)  # uniform over the hemisphere
+    place = np.repeat(np.arange(len(tile)), samples)
+    slots, slot = np.unique(np.stack([place, paths.triangle], 1), axis=0, return_inverse=True)  # in a frame each
+    sums = np.zeros((len(slots), Y.shape[1], 3, lit.irradiance.shape[2]))
     for first in range(0, count, _CALL):
         part = slice(first, min(first + _CALL, count))
-        alive = np.flatnonzero(paths.incoming[part, 2] > 0)
-        light = lit.arriving(paths.origins[part], directions[part], alive, walk, chance)
         shared = np.stack([edges[group[part]], edges[group[part] + 1]], 1)
-        surface = paths.base[part], paths.gloss[part]
-        worth = ggx.shared(paths.incoming[part], *surface, shared, paths.outgoing, Y.astype(np.float32))
-        _project(light, worth, turns, of_path[part], np.arange(part.start, part.stop) // samples, sums)
-    return sums
+        worth = ggx.shared(paths.incoming[part], paths.base[part], paths.gloss[part], shared, paths.outgoing, Y)
+        alive = np.flatnonzero(paths.incoming[part, 2] > 0)
+        for light in lit.arriving(paths.origins[part], directions[part], alive, walk, chance):
+            _add(*light, worth, slot[part], sums)
+    return _in_world(sums, slots[:, 0], tracer.frames[slots[:, 1]].astype(np.float64), exits.order)
 
 
 def mirrored(directions: Float32[np.ndarray, "n 3"], order: int) -> Float32[np.ndarray, "n even"]:
@@ -279,43 +235,50 @@ def _turned(frames: Float64[np.ndarray, "n 3 3"], order: int) -> Float64[np.ndar
     return found
 
 
+def _in_world(
+    sums: Float64[np.ndarray, "slots even 3 lightings"],
+    place: Int[np.ndarray, " slots"],
+    frames: Float64[np.ndarray, "slots 3 3"],
+    order: int,
+) -> Float64[np.ndarray, "lightings places harmonics 3"]:
+    """Coefficients of each slot's frame, added up in the world's for each place."""
+    found = np.zeros((sums.shape[3], place[-1] + 1, harmonics.count(order), 3))
+    turns, row = _turned(frames, order), 0
+    for degree in range(order + 1):
+        rows, wide = slice(row, row + degree + 1), 2 * degree + 1
+        turned = np.einsum("sek,secl->lskc", turns[:, rows, :wide], sums[:, rows])
+        for slot, home in enumerate(place):
+            found[:, home, degree**2 : (degree + 1) ** 2] += turned[:, slot]
+        row += degree + 1
+    return found
+
+
 @compiled
-def _project(
-    light: np.ndarray,
+def _add(
+    ray: np.ndarray,
+    row: np.ndarray,
+    factor: np.ndarray,
+    table: np.ndarray,
     worth: np.ndarray,
-    turns: np.ndarray,
-    turn: np.ndarray,
-    place: np.ndarray,
+    slot: np.ndarray,
     sums: np.ndarray,
 ) -> None:
-    """Adds to each place what its paths found, times what that is worth to the harmonics, turned into the world."""
-    order = turns.shape[2] // 2
-    own = np.zeros((sums.shape[2], 3))
-    for path in range(len(place)):
-        own[:] = 0
-        row = 0
-        for degree in range(order + 1):
-            for _ in range(degree + 1):
-                for k in range(2 * degree + 1):
-                    share = turns[turn[path], row, k]
-                    for channel in range(3):
-                        own[degree * degree + k, channel] += share * worth[path, row, channel]
-                row += 1
-        for lighting in range(len(light)):
-            red, green, blue = light[lighting, path, 0], light[lighting, path, 1], light[lighting, path, 2]
-            if red + green + blue > 0:
-                for k in range(len(own)):
-                    sums[lighting, place[path], k, 0] += red * own[k, 0]
-                    sums[lighting, place[path], k, 1] += green * own[k, 1]
-                    sums[lighting, place[path], k, 2] += blue * own[k, 2]
+    """Adds what each ray found, times what that is worth to each harmonic, to its slot: all lightings in one go."""
+    for i in range(len(ray)):
+        light, share, own = table[row[i]], worth[ray[i]], sums[slot[ray[i]]]
+        for k in range(len(share)):
+            for channel in range(3):
+                times = np.float64(share[k, channel] * factor[i, channel])
+                for lighting in range(light.shape[1]):
+                    own[k, channel, lighting] += times * light[channel, lighting]
 
 
 def choose_samples(lit: Lit, exits: Exits, *, target: float, seed: int, stream: str) -> tuple[int, float]:
-    """Paths per place that a target for the noise takes, measured at a few places, and the noise to expect.
+    """Rays per place that a target for the noise takes, measured at a few places, and the noise to expect.
 
     Args:
       lit, exits: see `trace_exitant`.
-      target: RMSE over all directions, places and lightings as a share of the mean; more than so many thousand paths are never
+      target: RMSE over all directions, places and lightings as a share of the mean; more than so many thousand rays are never
         chosen.
       seed, stream: address of the random numbers; independent of those of `trace_exitant` with that stream.
     """
