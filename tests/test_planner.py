@@ -229,7 +229,9 @@ def test_a_time_on_a_busy_machine_is_an_interval() -> None:
         planner = Planner(BASE, VALUES, BASES, ("half",), {"frame_us": 1.0})
         planner.add(replace(world(BASE), frame_spread=(off,) * len(LADDER)))
         assert planner.guesses(Plan(BASE, 128, "half"))["frame_us"].spread == max(off, 0.03)
-        assert planner.guesses(Plan((128.0, *BASE[1:]), 128, "half"))["frame_us"].spread >= max(off, 0.08)
+        assert planner.guesses(Plan((*BASE[:2], 0.02, BASE[3]), 128, "half"))["frame_us"].spread >= max(off, 0.08)
+        size = planner.guesses(Plan(BASE, 128, "half"))["megabytes"]
+        assert np.exp(size.chance(1.0001 * np.exp(size.mean))) > 0.99, "bytes that were counted are no interval"
 
 
 @pytest.mark.parametrize(("knob", "more"), [("atlas.resolution", False), ("points.count", True), ("lightings.train", False)])

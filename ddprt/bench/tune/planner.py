@@ -339,7 +339,7 @@ class Planner:
             whole = float(np.hypot(spread, rest / error**2 * laws["rest"].spread))
             spread, skew = whole, skew * (spread / whole) ** 3  # third moments add up, and a law's is 0
         found = {"relative_rmse": Guess(log(max(error, _TINY)), max(spread, 1e-3), skew)}
-        off = {"frame_us": max(_AGAIN, _between(trial.bases, trial.frame_spread, bases)), "megabytes": _AGAIN}
+        off = {"frame_us": max(_AGAIN, _between(trial.bases, trial.frame_spread, bases)), "megabytes": 0.0}  # bytes are counted
         for name, curve in (("frame_us", trial.frame_us), ("megabytes", trial.megabytes[precision])):
             certain = known and bases in trial.bases
             farther = off[name] if certain else max(off[name], laws[name].spread)
