@@ -75,6 +75,10 @@ def one(kind: str, changes: dict[str, str], folder: str) -> dict[str, Any]:
         if name == "probes" and path.stem != "places":
             held = path.stem.split(".")[0]
             own = "emission" if held == "constant" else f"probes {'test' if int(held) in data.split('test') else 'train'}"
+        if name.startswith("gloss-") and path.stem != "places":
+            held = path.stem.split(".")[0]
+            split = "test" if held != "constant" and int(held) in data.split("test") else "train"
+            own = "emission" if held == "constant" else f"gloss {split}, order {name.removeprefix('gloss-')}"
         own = "emission" if path.name == CONSTANT else own
         baked[own][2] += 1
         baked[own][3] += path.stat().st_size
