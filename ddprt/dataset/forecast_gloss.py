@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ddprt.axes import Float32, Int
+from ddprt.axes import Float32, Float64, Int
 from ddprt.dataset.forecast_indirect import SCRATCHED, direct_again
 from ddprt.dataset.gloss import RAYS_FOR_A_PATH, gloss_layers
 from ddprt.dataset.layers import Layer, write_light, write_places
@@ -17,6 +17,7 @@ from ddprt.dataset.probes import Sent
 from ddprt.dataset.sampled import WIDE, Expected, Sampled, on_a_line, scratched
 from ddprt.dataset.store import read_map
 from ddprt.lights import Lighting
+from ddprt.scene.atlas import weights_at
 from ddprt.transport.glossiness import glossy
 
 _LOOKED_AT = 128  # texels that the choice of rays looks at
@@ -124,7 +125,7 @@ def _shown(
     stand_ins: Int[np.ndarray, " lightings"],
     emitters: Any = None,
 ) -> Any:
-    """What is to be seen, indirect light as the operator's senders have it, from which all surfaces scatter evenly.
+    """What is to be seen: indirect light as the operator's senders have it, as if metals scattered evenly what they reflect.
 
     Direct light alone would do for the time that rays take, not for how many: it is darker, and differs more from place to
     place. Where nothing is scattered no light is told, and none is seen.
@@ -132,7 +133,8 @@ def _shown(
     from ddprt.transport.operator import Operator
     from ddprt.transport.reflected import Lit
 
-    operator = Operator.of(job.tracer, job.atlas, job.config.transport.sender_resolution)
+    atlas = replace(job.atlas, albedo=_reflected(job))
+    operator = Operator.of(job.tracer, atlas, job.config.transport.sender_resolution)
     averaged = np.concatenate([operator.averaged(light) for light in direct], 1)
     bounces = job.bounces + (job.bounces > 0)  # one of them is counted as gathered
     radiosity = operator.bounce(averaged, seed=job.config.seed, stream="shown", bounces=bounces).radiosity
@@ -141,6 +143,16 @@ def _shown(
     spread = indirect.reshape(len(indirect), len(direct), 3)[operator.senders.of_texel]
     irradiance = spread.transpose(0, 2, 1) + direct.transpose(1, 2, 0)
     return Lit.of(job.tracer, job.scene, job.atlas, lightings, irradiance[:, :, stand_ins], emitters)
+
+
+def _reflected(job: Sampled) -> Float64[np.ndarray, "texels 3"]:
+    """Albedo of texels, that of metals included: by the middle of each piece of a triangle."""
+    atlas, triangle = job.atlas, job.atlas.piece_triangle
+    middle = atlas.piece_corners.mean(1, dtype=np.float64)
+    albedo = job.scene.albedo_at(triangle, weights_at(job.tracer.corners[triangle].astype(np.float64), middle))
+    total = np.bincount(atlas.piece_texel, atlas.piece_area, atlas.count)
+    sums = [np.bincount(atlas.piece_texel, atlas.piece_area * albedo[:, channel], atlas.count) for channel in range(3)]
+    return np.stack(sums, 1) / np.maximum(total, np.finfo(float).tiny)[:, None]
 
 
 def _traced(job: Sampled, lit: Any, layer: Layer, exits: Any, split: str, count: int) -> tuple[float, float]:
