@@ -29,7 +29,7 @@ from ddprt.pipeline import Run
 from ddprt.scene.library import SCENES
 
 _OWN = {
-    **dict.fromkeys(("statue", "convex"), {"lightings.distribution": "around"}),
+    **{name: {"lightings.distribution": "around"} for name in ("statue", "convex")},
     "glossy-room": {"transport.target_noise": 0.05},  # else paths take hours
 }
 _SMALL = 0.3  # seconds
