@@ -41,7 +41,8 @@ def bake_to_target(scene: Scene, config: Config, folder: Path, progress: Progres
     if count is None:
         count = sizes[-1]
         fewest = config.transport.model_copy(update={"test_samples": _FEWEST})
-        rough = config.model_copy(update={"transport": fewest, "probes": ProbesConfig()})  # nothing looks at their probes
+        bare = config.effects.model_copy(update={"glossy_layers": False})  # nothing looks at what is beside their lightmaps
+        rough = config.model_copy(update={"transport": fewest, "probes": ProbesConfig(), "effects": bare})
         for size in sizes[:-1]:
             trial = bake(scene, config=rough, out=trials / f"{size:06d}", first=size, once=once, progress=progress)
             if _told(trial, config, progress) <= target:

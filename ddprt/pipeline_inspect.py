@@ -183,12 +183,13 @@ def checkup() -> tuple[str, bool]:
 def _try_ray() -> str:
     from ddprt.scene.library import build
     from ddprt.transport.embree import Tracer
+    from ddprt.transport.packets import embree
 
     tracer = Tracer.of(build("furnace"))
     hits = tracer.closest(np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32))
     if not hits.front[0] or abs(hits.distance[0] - 1) > 0.01:
         raise RuntimeError(f"a ray in a unit sphere got {hits.distance[0]}, expected 1")
-    return "a ray in a unit sphere hits its wall"
+    return f"a ray in a unit sphere hits its wall; Embree {embree().version}, {embree().width} rays at a time"
 
 
 def _try_exr() -> str:

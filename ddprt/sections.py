@@ -160,6 +160,9 @@ class EffectsConfig(Section):
 
     on: tuple[str, ...] = Field((), description="effects to simulate though the scene does not call for them")
     off: tuple[str, ...] = Field((), description="effects to leave out though the scene calls for them")
+    glossy_layers: bool = Field(
+        True, description="keep what the eye sees on glossy texels, beside the lightmap that they light"
+    )
 
 
 class ProbesConfig(Section):

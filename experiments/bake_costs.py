@@ -62,7 +62,7 @@ def share_of_embree(on: Stage, rounds: int = 5) -> dict[str, float]:
         if len(batch) == 2:
             tracer.first(*batch)
         else:
-            tracer.unoccluded(*batch[:2], batch[2].copy())
+            tracer.unoccluded(*batch)
 
     shares = {}
     works: dict[str, tuple[Callable[[Any], None], list[Any], str]] = {

@@ -3,10 +3,14 @@
 from collections.abc import Iterator
 
 import pytest
+from hypothesis import settings
 
 from ddprt.scene.atlas import Atlas, build_atlas
 from ddprt.scene.library import build
 from ddprt.scene.mesh import Scene
+
+settings.register_profile("untimed", deadline=None)  # no test fails because a machine is busy
+settings.load_profile("untimed")
 
 
 @pytest.fixture(scope="session", autouse=True)

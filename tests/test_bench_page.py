@@ -197,7 +197,7 @@ def test_names_are_text_and_nothing_else(name: str, tmp_path: Path) -> None:
     assert svg.tag.endswith("svg")
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.recursive(st.none() | st.text() | st.integers(), lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner)))
 def test_embedded_json_reads_back_and_cannot_leave_its_element(value: Any) -> None:
     text = embedded(value)

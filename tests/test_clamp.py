@@ -94,7 +94,7 @@ def maps(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray]:
     return light.astype(np.float32), area.astype(np.float32)
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(maps())
 def test_it_keeps_energy_and_is_the_nearest_map(problem: tuple[np.ndarray, np.ndarray]) -> None:
     light, area = problem
@@ -115,7 +115,7 @@ def test_it_keeps_energy_and_is_the_nearest_map(problem: tuple[np.ndarray, np.nd
         np.testing.assert_array_less(np.abs(got - expected) * payers, level_off + EPS * np.abs(light).max() + TINY)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(maps(), st.integers(0, 2**32 - 1))
 def test_no_map_of_that_energy_is_farther_than_before(problem: tuple[np.ndarray, np.ndarray], seed: int) -> None:
     """Projection on a convex set: whatever the reference is, if its energy was met, clamping has come nearer to it."""

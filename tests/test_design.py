@@ -62,7 +62,7 @@ def mean_variance(rows: np.ndarray, chosen: list[int], ridge: float) -> float:
 
 
 @given(seed=st.integers(0, 10_000), ridge=st.sampled_from([1e-3, RIDGE, 0.5]))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_each_choice_lowers_the_mean_variance_most(seed: int, ridge: float) -> None:
     rows = rows_of(seed)
     found = choose_rows(rows, 5, ridge=ridge).tolist()
@@ -80,7 +80,7 @@ def test_many_columns_and_many_candidates_agree() -> None:
 
 
 @given(seed=st.integers(0, 10_000))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_columns_span_the_greatest_volume_greedily(seed: int) -> None:
     rows = np.random.default_rng(seed).normal(size=(7, 9))
     order = choose_columns(rows, 4).tolist()
@@ -105,7 +105,7 @@ def test_samples_told_apart_by_too_few_lightings_keep_their_order() -> None:
 
 
 @given(seed=st.integers(0, 10_000))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_permuted_candidates_permute_the_choice(seed: int) -> None:
     rows, turn = rows_of(seed, 12), np.random.default_rng(seed).permutation(12)
     assert turn[choose_rows(rows[turn], 6)].tolist() == choose_rows(rows, 6).tolist()

@@ -15,7 +15,7 @@ from scipy.special import j0
 import ddprt
 from ddprt import seeds, warp
 from ddprt.config import Config, checked
-from ddprt.dataset.gloss import GlossBake, gloss_layers
+from ddprt.dataset.gloss import gloss_layers
 from ddprt.dataset.layers import layers, read_layer, read_light
 from ddprt.dataset.manifest import Manifest, layer_name
 from ddprt.dataset.store import Dataset
@@ -297,14 +297,16 @@ def test_each_material_pays_for_its_own_order(room: Scene) -> None:
     material = room.material.copy()
     material[half] = len(room.materials)
     mixed = replace(room, material=material, materials=(*room.materials, smooth))
-    assert gloss_layers(mixed) == [{"name": f"gloss-{order}", "quantity": "radiance", "order": order} for order in (4, 8)]
+    assert gloss_layers(job(), mixed) == [
+        {"name": f"gloss-{order}", "quantity": "radiance", "order": order} for order in (4, 8)
+    ]
     atlas = build_atlas(mixed, 32)
     for order, index in ((4, 3), (8, 4)):
         exits = Exits.of(mixed, atlas, order)
         assert exits.sampler is not None
         assert (mixed.material[exits.sampler.triangle] == index).all()
         np.testing.assert_allclose(exits.weight.sum(), mixed.areas[material == index].sum(), rtol=1e-6)
-    assert not set(gloss_layers(build("cornell"))[:1])
+    assert gloss_layers(job(), build("cornell")) == []
 
 
 # --- in a bake --------------------------------------------------------------------------------------------------------
@@ -373,13 +375,14 @@ def test_held_out_light_is_the_mean_of_its_halves(data: Dataset, room: Scene) ->
     np.testing.assert_array_equal(read_light(data, layer, test, "noise"), (halves[0] - halves[1]) / 2)
 
 
-def test_lightmaps_keep_their_bits(data: Dataset, room: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All but the layer is what it would be without it."""
-    monkeypatch.setattr(GlossBake, "all", classmethod(lambda cls, *args, **settings: ()))
-    with pytest.raises(UserError, match="files missing"):
+def test_lightmaps_keep_their_bits(data: Dataset, room: Scene, tmp_path: Path) -> None:
+    """All but the layer is what it would be without it; and without it is another dataset."""
+    bare = {**job().model_dump(), "effects": {"glossy_layers": False}}
+    plain = ddprt.bake(room, config=checked(bare), out=tmp_path / "bare")
+    assert sums(plain) == {name: digest for name, digest in sums(data).items() if not name.startswith("gloss-")}
+    assert layers(plain) == []
+    with pytest.raises(UserError, match=r"holds another dataset .*layers"):
         ddprt.bake(room, config=job(), out=tmp_path / "bare")
-    bare = {name: entry["sha256"] for name, entry in Manifest(tmp_path / "bare").entries.items()}
-    assert bare == {name: digest for name, digest in sums(data).items() if not name.startswith("gloss-")}
 
 
 def test_without_gloss_nothing_is_imported() -> None:

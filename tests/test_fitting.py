@@ -246,7 +246,7 @@ def test_trouble_is_a_status() -> None:
 
 
 @given(st.integers(0, 10_000), st.sampled_from([2, 20]), st.sampled_from([1, 6, 20]), st.sampled_from([0.0, 1e-6, 1e-2, 1.0]))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_residual_never_grows_with_less_ridge(seed: int, lightings: int, points: int, ridge: float) -> None:
     X, C = problem(lightings, points, 2, seed)
 

@@ -38,9 +38,9 @@ def _simulation(scene: Scene) -> ModuleType | None:
     return import_module("ddprt.transport.exitant") if any(glossy(scene)) else None
 
 
-def gloss_layers(scene: Scene) -> list[dict[str, Any]]:
-    """What dataset.json tells of glossy texels; empty where none is simulated."""
-    module = _simulation(scene)
+def gloss_layers(config: Config, scene: Scene) -> list[dict[str, Any]]:
+    """What dataset.json tells of glossy texels; empty where none is simulated, or none is to be kept."""
+    module = _simulation(scene) if config.effects.glossy_layers else None
     glows = {"constant": True} if module and plan(scene, ()).called("emission") else {}
     return [{**_entry(order), **glows} for order in module.orders(scene)] if module else []
 
@@ -87,7 +87,7 @@ class GlossBake:
 
         An order whose materials are nowhere in the open has a layer without places, which nothing learns.
         """
-        module = _simulation(scene)
+        module = _simulation(scene) if config.effects.glossy_layers else None
         if module is None:
             return ()
         found = list[GlossBake]()

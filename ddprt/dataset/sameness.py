@@ -28,7 +28,7 @@ def baked_settings(config: Config, scene: Scene) -> dict[str, Any]:
         "seed": config.seed,
         "transport": transport | {"integrator": valid_integrator(transport["integrator"], scene)},
         "placing": config.points.model_dump(exclude={"quantity"}),
-        "layers": probe_layers(config, scene) + gloss_layers(scene),
+        "layers": probe_layers(config, scene) + gloss_layers(config, scene),
     }
 
 

@@ -18,7 +18,7 @@ from ddprt.compiled import compiled
 from ddprt.scene.atlas import SHUT, Atlas, restricted, weights_at
 from ddprt.scene.holes import Holes
 from ddprt.scene.mesh import Scene
-from ddprt.transport.embree import Geometry
+from ddprt.transport.packets import Geometry
 
 LAYERS = 1024
 """Holes that a ray may pass; the next one stops it as if it were none. So no scene keeps a ray for ever."""
@@ -80,13 +80,12 @@ class Openwork:
     ) -> Int32[np.ndarray, " rays"]:
         """As `Tracer.unoccluded`."""
         self._count(len(origins))
-        limit = reach.copy()
         seen = self._opaque.unoccluded(origins, directions, reach)
         chosen = np.empty(len(seen) + 1, np.int64)
-        near = chosen[: _choose(seen, origins, directions, limit, self._low, self._high, chosen)]
+        near = chosen[: _choose(seen, origins, directions, reach, self._low, self._high, chosen)]
         if len(near):
             none = np.full(len(near), -1, np.int32)
-            layer = self._passed(origins[near], directions[near], limit[near], np.full(len(near), -self.step), none)
+            layer = self._passed(origins[near], directions[near], reach[near], np.full(len(near), -self.step), none)
             seen[near[layer[0] >= 0]] = 0
         return seen
 

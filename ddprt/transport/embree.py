@@ -1,4 +1,4 @@
-"""The only door to Embree: closest hits and shadow rays, threaded over slices.
+"""Rays at a scene: closest hits and shadow rays, threaded over slices. They reach Embree through `packets`.
 
 Rays live in the scene's own frame (relative to its centre), so that float32 keeps its precision far from the origin.
 Every origin is moved off its surface by one named distance, and shadow rays stop short of the light by the same. Sides of a
@@ -17,11 +17,11 @@ import numpy as np
 
 from ddprt import warp
 from ddprt.axes import Bool, Float32, Float64, Int32
-from ddprt.errors import UserError
 from ddprt.scene.distance import distance_within
 from ddprt.scene.holes import Holes
 from ddprt.scene.mesh import Scene
 from ddprt.scene.sheets import back_to_back
+from ddprt.transport.packets import Geometry
 
 SELF_OFFSET = 2e-6
 """Distance between a ray's origin and its surface, as a share of the bounding box's diagonal: about 30 times the rounding
@@ -49,39 +49,6 @@ class Hits:
     v: Float32[np.ndarray, " rays"]
     front: Bool[np.ndarray, " rays"]
     distance: Float32[np.ndarray, " rays"]
-
-
-class Geometry:
-    """Triangles that Embree knows.
-
-    Args:
-      corners: metres.
-    Raises:
-      UserError: embreex is missing (there is no slow fallback).
-    """
-
-    def __init__(self, corners: Float32[np.ndarray, "triangles 3 3"]) -> None:
-        try:
-            from embreex.mesh_construction import TriangleMesh
-            from embreex.rtcore_scene import EmbreeScene
-        except ImportError as error:
-            raise UserError(f"embreex: got {error}, expected the ray tracer; pip install embreex") from None
-        self._embree = EmbreeScene()
-        index = np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)
-        self._mesh = TriangleMesh(self._embree, corners.reshape(-1, 3), index)
-        # The first run commits the scene; it must not happen in two threads at once.
-        self._embree.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
-
-    def first(
-        self, origins: np.ndarray, directions: np.ndarray, reach: Float32[np.ndarray, " rays"] | None = None
-    ) -> tuple[np.ndarray, ...]:
-        """See `Tracer.first`; nothing further than `reach` metres counts, which Embree overwrites."""
-        found = self._embree.run(origins, directions, dists=reach, query="INTERSECT", output=True)
-        return found["primID"], found["u"], found["v"], found["tfar"]
-
-    def unoccluded(self, origins: np.ndarray, directions: np.ndarray, reach: np.ndarray) -> Int32[np.ndarray, " rays"]:
-        """See `Tracer.unoccluded`."""
-        return self._embree.run(origins, directions, dists=reach, query="OCCLUDED")
 
 
 class Tracer:
@@ -144,7 +111,7 @@ class Tracer:
         directions: Float32[np.ndarray, "rays 3"],
         reach: Float32[np.ndarray, " rays"],
     ) -> Int32[np.ndarray, " rays"]:
-        """Not 0 where nothing lies within `reach` metres of an origin; contiguous arrays. Embree overwrites `reach`."""
+        """Not 0 where nothing lies within `reach` metres of an origin; contiguous arrays."""
         if self.openwork:
             return self.openwork.unoccluded(origins, directions, reach)
         self._count(len(origins))

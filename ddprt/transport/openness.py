@@ -178,7 +178,7 @@ class _Opener:
         chosen = np.flatnonzero(length > 4 * clear)
         directions = along[chosen] / length[chosen, None]
         origins, reach = start[chosen] + clear * directions, length[chosen] - 2 * clear
-        stopped = np.flatnonzero(self.tracer.unoccluded(origins, directions, reach.copy()) == 0)
+        stopped = np.flatnonzero(self.tracer.unoccluded(origins, directions, reach) == 0)
         if len(stopped):
             triangle, _, _, distance = self.tracer.first(origins[stopped], directions[stopped])
             other = (triangle >= 0) & (distance <= reach[stopped])

@@ -154,6 +154,7 @@ class Bakery:
                 **config.model_dump(include={"seed", "scene", "atlas", "points", "fit"}),
                 "transport": config.transport.model_dump() | transport,
                 "points": config.points.model_dump() | {"depth": depth},
+                "effects": {"glossy_layers": False},
             }
         )
         records = {split: [lighting_json(lighting) for lighting in listed] for split, listed in lightings.items()}
