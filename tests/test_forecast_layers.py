@@ -134,6 +134,14 @@ def test_rays_of_gloss_are_chosen_in_what_stands_in_for_the_maps(tmp_path: Path)
     assert told[name].rays == pytest.approx(stages[name]["rays"], rel=0.1)
 
 
+def test_layers_that_are_not_kept_are_not_counted(tmp_path: Path) -> None:
+    transport = {"samples": 4, "test_samples": 8}
+    config = config_of("glossy-room", 20, transport=transport, effects={"glossy_layers": False})
+    found, stages = baked(glowing("glossy-room"), config, tmp_path)
+    assert not any(name.startswith("gloss") for name in stages)
+    assert found.files == sum(path.is_file() for path in (tmp_path / "data").rglob("*"))
+
+
 def test_maps_and_layers_of_both_halves_lie_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """12 bytes for each texel, and for each coefficient, of each lighting and half; one half of the maps is there already."""
     held: list[float] = []

@@ -18,7 +18,6 @@ from ddprt.dataset.sampled import WIDE, Expected, Sampled, on_a_line, scratched
 from ddprt.dataset.store import read_map
 from ddprt.lights import Lighting
 from ddprt.scene.atlas import weights_at
-from ddprt.transport.glossiness import glossy
 
 _LOOKED_AT = 128  # texels that the choice of rays looks at
 _CHOICE = 7  # times as much as in float32 it holds of them: two runs and their difference in float64, one as it came
@@ -34,12 +33,10 @@ def expect_gloss(
       split: "train" (with validation) or "test".
       indices, seen: its lightings, and those whose direct light lies in the folder.
     """
-    if not any(glossy(job.scene)):
-        return [], Expected("places", 0.0)
     begun = time.perf_counter()
     places, halves, stages = _placed(job), 1 + (split == "test"), list[Expected]()
     once = Expected("places", 0.0)
-    if split == "train":
+    if places and split == "train":
         names = [layer_name(layer.name, "places") for layer, _ in places]
         once = Expected("places", time.perf_counter() - begun, 0, len(names), job.size(names))
     lit, reading, again = None, 0.0, (0.0, 0.0)
@@ -67,8 +64,6 @@ def expect_gloss_constant(
       light: of it, on all texels, as it comes straight from there.
     """
     seconds, rays, names = 0.0, 0.0, list[str]()
-    if not any(glossy(job.scene)):
-        return seconds, rays, names
     lit = None
     for layer, exits in _placed(job):
         if job.bounces != 0 and exits.count:
@@ -83,10 +78,10 @@ def expect_gloss_constant(
 
 
 def _placed(job: Sampled) -> list[tuple[Layer, Any]]:
-    """Layers, and their places as the simulation knows them; written as the bake does."""
-    found, exitant = list[tuple[Layer, Any]](), import_module("ddprt.transport.exitant")
-    for entry in gloss_layers(job.scene):
-        exits = exitant.Exits.of(job.scene, job.atlas, entry["order"])
+    """Layers, and their places as the simulation knows them; written as the bake does. None, and no import, without gloss."""
+    found = list[tuple[Layer, Any]]()
+    for entry in gloss_layers(job.config, job.scene):
+        exits = import_module("ddprt.transport.exitant").Exits.of(job.scene, job.atlas, entry["order"])
         kind = {key: entry[key] for key in ("name", "quantity", "order")}
         layer = Layer(**kind, position=job.atlas.position[exits.texel], weight=exits.weight, texel=exits.texel)
         write_places(job.folder, layer, job.manifest)
