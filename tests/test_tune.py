@@ -28,6 +28,7 @@ from ddprt.config import Config, load_config
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.files import alone_in
+from ddprt.pipeline import Run
 from ddprt.progress import Progress
 from ddprt.report.metrics import Tally
 from ddprt.runtime.precision import shipped_bytes, stored
@@ -104,6 +105,19 @@ def test_what_cannot_be_shown_is_said_with_its_bounds(tuned: tuple[Path, Outcome
     assert ("no setting is known to meet the budget; nearest: " in text) != met
     assert "no setting meets" not in text
     assert "\nmeets" not in text
+
+
+def test_what_cannot_be_shown_is_no_claim_that_nothing_meets_it(
+    tuned: tuple[Path, Outcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    doubt = Doubt(tuned[1].plan, tuned[1].setting, 0.4, "frame_us", 5.1, 4.6, 5.9)
+    monkeypatch.setattr(Run, "tune", lambda self: replace(tuned[1], met=False, doubt=doubt))
+    (tmp_path / "job.toml").write_text(SMALL)
+    assert call("tune", tmp_path / "job.toml", "--out", tmp_path / "run", "--max-frame-us", "5", "--quiet") == 2
+    assert capsys.readouterr().err == (
+        "ddprt: ddprt tune: got a budget that cannot be shown to be met, frame_us is in doubt; "
+        f"raise --max-frame-us, or take {tmp_path / 'run' / 'tune' / 'nearest.toml'}\n"
+    )
 
 
 def test_a_search_that_was_stopped_bakes_nothing_again(tuned: tuple[Path, Outcome], monkeypatch: pytest.MonkeyPatch) -> None:
