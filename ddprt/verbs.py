@@ -149,9 +149,13 @@ def tune(call: Call) -> None:
     outcome = job.tune()
     print(told(outcome))
     if not outcome.met:
+        if outcome.doubt:
+            limit, what = outcome.doubt.quantity, f"that cannot be shown to be met, {outcome.doubt.quantity} is in doubt"
+        else:
+            limit, what = outcome.binding, f"that no setting meets, {outcome.binding} stands in the way"
         raise UserError(
-            f"ddprt tune: got a budget that no setting meets, {outcome.binding} stands in the way; "
-            f"raise --max-{outcome.binding.replace('_', '-')}, or take {job.folder / 'tune' / 'nearest.toml'}"
+            f"ddprt tune: got a budget {what}; "
+            f"raise --max-{limit.replace('_', '-')}, or take {job.folder / 'tune' / 'nearest.toml'}"
         )
     print(f"config:   {job.folder / 'tune' / 'tuned.toml'}")
 

@@ -13,7 +13,9 @@ Relighting is cold: models take turns, so that no cache holds a basis. Random bu
 that is measured as a whole, tighter and looser than these reach. An answer counts as a hit when the setting keeps within the
 limits, its error taken on held-out lightings of another seed; or when `tune` refuses and no setting of the grid keeps within
 them, its error taken on the same. These are so many (`FRESH`) that a limit is not missed for the luck of the draw alone; what
-the answers come to on the first few of them, as many as the configuration holds out, is told beside it. A search costs what
+the answers come to on the first few of them, as many as the configuration holds out, is told beside it. Where `tune` says that
+it cannot be shown, that is no hit, but counted apart, and apart of these how often what it is in doubt about lies where it is
+said to: an error on fresh lightings, a time measured once more. A search costs what
 baking and fitting its trials took, and baking held-out lightings beyond those of the configuration; the grid what baking and
 fitting all of its places took. Places that cannot be baked are left out of the grid, and told once.
 """
@@ -43,8 +45,10 @@ from ddprt.bench.measure.yardstick import Yardstick, make_yardstick
 from ddprt.bench.peers import fit, relight, roofline
 from ddprt.bench.peers.peers import GRAM, Sizes, measure, table
 from ddprt.bench.peers.standing import OURS, Peer, Row, best, compare
+from ddprt.bench.tune.curves import time_of_frame
 from ddprt.bench.tune.held_out import spread_of
-from ddprt.bench.tune.planner import Guess, Place, Plan, Trial
+from ddprt.bench.tune.outcome import Doubt
+from ddprt.bench.tune.planner import Guess, Place, Plan, Trial, seconds
 from ddprt.bench.tune.search import Search
 from ddprt.config import Config, checked
 from ddprt.dataset.forecast import forecast
@@ -54,7 +58,8 @@ from ddprt.machine import instruction_set
 from ddprt.pipeline import Run
 from ddprt.progress import Progress
 from ddprt.report.metrics import Tally
-from ddprt.runtime.precision import stored
+from ddprt.runtime.model import Model
+from ddprt.runtime.precision import shipped_bytes, stored
 from ddprt.runtime.train import fit_config
 
 QUIET = Progress(quiet=True)
@@ -237,7 +242,7 @@ class Contest:
             if place in self.barred:
                 raise UserError(self.barred[place])
             assert known is not None
-            return known[place]
+            return found.scored_again(known[place]) if found.held_out.seconds else known[place]
 
         found = Search(asked, self.workshop, self.factors, told if known else None, expected)
         if self.quick:
@@ -248,7 +253,9 @@ class Contest:
         """Asks `tune` for budgets, and checks every answer.
 
         Returns:
-          hits, of; hits_on_few: on as many fresh lightings as the configuration holds out; refused; trials: bakes of a search,
+          hits, of; wrong; undecided, held: of these, those whose doubt has the right bounds; within: how wide these are, as a
+          share, on average; frames: settings said to meet the budget, or that they may, whose time measured once more is beyond
+          its limit; hits_on_few: on as many fresh lightings as the configuration holds out; refused; trials: bakes of a search,
           held_out: its lightings, on average; cost_of_grid: share of the grid's seconds that a search takes, on average, and
           largest; grid: places, barred: those that cannot be baked; fresh_spread: how far off an error on the fresh lightings
           is, as a share, at its largest.
@@ -274,12 +281,17 @@ class Contest:
             told = ", ".join(f"{name} {limit:.3g}" for name, limit in limits.items())
             print(f"  {self.scene}: {told}: {answer['told']}, {answer['share']:.1%} of the grid's cost", flush=True)
             found.append(answer)
-        shares = [answer["share"] for answer in found]
+        shares, open_ = [answer["share"] for answer in found], [answer for answer in found if answer["undecided"]]
         return {
             "hits": sum(answer["right"] for answer in found),
             "of": count,
+            "wrong": sum(not (answer["right"] or answer["undecided"]) for answer in found),
+            "undecided": len(open_),
+            "held": sum(answer["held"] for answer in open_),
+            "within": round(float(np.mean([answer["within"] for answer in open_])), 4) if open_ else None,
+            "frames": sum(answer["frame_beyond"] for answer in found),
             "hits_on_few": sum(answer["right_on_few"] for answer in found),
-            "refused": sum(not answer["met"] for answer in found),
+            "refused": sum(not answer["met"] and not answer["undecided"] for answer in found),
             "trials": round(float(np.mean([answer["trials"] for answer in found])), 2),
             "held_out": round(float(np.mean([answer["held_out"] for answer in found]))),
             "cost_of_grid": round(float(np.mean(shares)), 4),
@@ -293,7 +305,18 @@ class Contest:
     def _answer(self, limits: dict[str, float], known: dict[Place, Trial]) -> dict[str, Any]:
         search = self.search({f"max_{name}": limit for name, limit in limits.items()}, known)
         outcome, limit = search.run(), limits["relative_rmse"]
+        doubt, held, again = outcome.doubt, False, 0.0
         if outcome.met:
+            again = self._frame_us(search, outcome.plan)
+        if doubt:
+            tally = self._tally(search, doubt.plan)
+            truth, spread = self._truth(search, doubt, known), spread_of(tally)[0]
+            right, held, right_on_few = False, doubt.low <= truth <= doubt.high, False
+            what = (
+                f"{'may meet' if outcome.met else 'not known'} (a chance of {doubt.chance:.0%}), undecided within "
+                f"{doubt.within:.0%}: {doubt.quantity} of {doubt.low:.3g} to {doubt.high:.3g}, {truth:.3g} in truth"
+            )
+        elif outcome.met:
             tally = self._tally(search, outcome.plan)
             error, few, spread = pooled(tally), pooled(tally, self.base.lightings.test), spread_of(tally)[0]
             right, right_on_few = error <= limit, few <= limit
@@ -318,22 +341,42 @@ class Contest:
         return {
             "met": outcome.met,
             "right": bool(right),
+            "undecided": doubt is not None,
+            "held": bool(held),
+            "within": doubt.within if doubt else 0.0,
+            "frame_beyond": bool(again > limits["frame_us"]),
             "right_on_few": bool(right_on_few),
             "trials": outcome.trials,
             "held_out": outcome.held_out,
             "fresh_spread": spread,
             "seconds": sum(map(seconds, search.planner.trials)) + search.held_out.seconds,
             "told": f"{what}, after {outcome.trials} bakes and {outcome.held_out} held-out lightings, "
-            + ("right" if right else "WRONG"),
+            + (("held" if held else "NOT HELD") if doubt else "right" if right else "WRONG"),
         }
+
+    def _truth(self, search: Search, doubt: Doubt, known: dict[Place, Trial]) -> float:
+        """What a doubtful quantity is: an error on fresh lightings, a time measured once more or when the grid was."""
+        if doubt.quantity == "relative_rmse":
+            return pooled(self._tally(search, doubt.plan))
+        if doubt.quantity == "frame_us":
+            return self._frame_us(search, doubt.plan)
+        if doubt.quantity == "megabytes":
+            return shipped_bytes(self._model(search, doubt.plan), doubt.plan.precision) / 1e6
+        return float(getattr(known[doubt.plan.place], doubt.quantity))
+
+    def _model(self, search: Search, plan: Plan) -> Model:
+        setting = search.setting(plan)
+        return stored(fit_config(self.workshop.bake(setting)[0], setting.config, "svd-ridge"), plan.precision)
+
+    def _frame_us(self, search: Search, plan: Plan) -> float:
+        data, model = self.workshop.bake(search.setting(plan))[0], self._model(search, plan)
+        values = data.values(data.split("train")[:1], model.points, model.quantity)[0]
+        return time_of_frame(model, values, limit=search.limits["frame_us"])[0]
 
     def _tally(self, search: Search, plan: Plan) -> Tally:
         """Errors of a plan on fresh lightings."""
         if plan not in self._fresh_tallies:
-            setting = search.setting(plan)
-            data, _ = self.workshop.bake(setting)
-            model = stored(fit_config(data, setting.config, "svd-ridge"), plan.precision)
-            self._fresh_tallies[plan] = self.fresh.tally(model)
+            self._fresh_tallies[plan] = self.fresh.tally(self._model(search, plan))
         return self._fresh_tallies[plan]
 
     def _bar(self, search: Search, place: Sequence[float], reason: str) -> None:
@@ -351,11 +394,6 @@ class Contest:
 
     def _tell(self, name: str, entry: dict[str, Any]) -> None:
         append_line(self.folder / name, json.dumps({"key": self.key, "environment": environment(), **entry}))
-
-
-def seconds(trial: Trial) -> float:
-    """What a place costs: its bake, and one fit."""
-    return trial.bake_seconds + trial.fit_seconds
 
 
 def trial_of(plain: dict[str, Any]) -> Trial:
@@ -447,7 +485,8 @@ def main(words: Sequence[str]) -> int:
         print(f"budget closes to {found['budget_closure']}: {clock(begun)}", flush=True)
         tuned = Contest("cornell", folder / "tune", quick).answers(10)
         print(f"tune: {tuned}: {clock(begun)}")
-        found |= {"tune_hits": tuned["hits"] / tuned["of"], "tune_trials": tuned["trials"]}
+        found |= {name: tuned[key] / tuned["of"] for name, key in (("tune_hits", "hits"), ("tune_undecided", "undecided"))}
+        found |= {"tune_trials": tuned["trials"]}
         found |= {"tune_cost_of_grid": tuned["cost_of_grid"], "tune_grid": tuned["grid"]}
         print(json.dumps(found | {"ddprt": ddprt.__version__, "seconds": round(time.perf_counter() - begun, 1)}))
     return 0

@@ -41,6 +41,8 @@ def test_each_time_there_are_twice_as_many_and_all_differ(workshop: Workshop) ->
     assert held_out.count == 16
     assert len({*drawn(held_out)}) == 16
     assert drawn(held_out)[:4] == first
+    assert held_out.more(0.5, 1e9, 4)
+    assert held_out.count == 64
     again = HeldOut(workshop)
     assert again.more(0.5, 0.0)
     assert drawn(again) == drawn(held_out)[:8]
@@ -95,7 +97,7 @@ def test_what_was_tried_is_scored_on_all_before_another_bake(workshop: Workshop,
     monkeypatch.setattr(Planner, "replace", note)
     monkeypatch.setattr(Planner, "undecided", lambda planner, plan: not seen and isinstance(plan, Plan))
     outcome = search.run()
-    assert outcome.held_out == search.held_out.count == 8
+    assert outcome.held_out == search.held_out.count == 16, "so near, twice as many are not likely to tell"
     (trial,) = seen
     model = fit_config(workshop.bake(Setting({}, base()))[0], base(fit__bases=trial.bases[-1]), "svd-ridge")
     # Stored as halves, which a trial's errors are of: a basis is rounded by a share of 2**-11, its light by no more.

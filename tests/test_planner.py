@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from ddprt.bench.tune.planner import KNOBS, QUANTITIES, Guess, Law, Place, Plan, Planner, Trial
 
@@ -29,6 +30,7 @@ def world(place: Place, rng: np.random.Generator | None = None) -> Trial:
         0.05,
         0.0,
         tuple(20 + texels * bases * 1e-4 for bases in LADDER),
+        (0.03,) * len(LADDER),
         {name: tuple(texels * bases * size / 1e6 for bases in LADDER) for name, size in (("half", 2), ("float", 4))},
         float(jitter * (1 + resolution**2 * (3 + 10 * lightings**0.6 * noise**-1.1))),
         float(0.5 + 2 * resolution**2 * lightings),
@@ -157,6 +159,79 @@ def test_a_chance_is_the_gaussian_one_without_skew_and_hall_s_with_it() -> None:
         t = 3 / skew * (np.cbrt(1 + skew * (x - skew / 6)) - 1)
         assert np.exp(Guess(0.0, 0.1, skew).chance(float(np.exp(-0.1 * t)))) == pytest.approx(0.9, rel=1e-9)
         assert -t > 1.2815515655446004, "farther than without skew"
+
+
+def test_a_quantile_is_the_limit_of_its_chance() -> None:
+    for skew in (-0.5, 0.0, 1e-9, 0.05, 0.3, 1.0):
+        guess = Guess(0.3, 0.1, skew)
+        for chance in (0.02, 0.3, 0.9, 0.98):
+            assert np.exp(guess.chance(guess.quantile(chance))) == pytest.approx(chance, rel=1e-6)
+        assert guess.quantile(0.02) < np.exp(0.3) < guess.quantile(0.98)
+
+
+@pytest.mark.parametrize("times", [2, 4])
+def test_how_likely_more_lightings_decide_is_as_often_as_they_do(times: int) -> None:
+    rng, draws, spread = np.random.default_rng(4), 40000, 0.08
+    for room in (-2.0, -0.7, 0.0, 0.5, 1.2):
+        error = world(BASE).errors[-1]
+        planner = Planner(BASE, VALUES, BASES, ("half",), {"relative_rmse": float(error * np.exp(room * spread))})
+        planner.add(replace(world(BASE), error_spread=spread))
+        # The truth about what is measured, other lightings about the truth, and the mean of all samples.
+        truth = spread * rng.normal(size=draws)
+        others = truth + spread / np.sqrt(times - 1) * rng.normal(size=draws)
+        mean = others * (times - 1) / times
+        likely = ndtr((room * spread - mean) / (spread / np.sqrt(times)))
+        decided = np.mean((likely >= 0.9) | (likely <= 0.02))
+        # A share of 40000 draws is known to 0.0025 at most, four of which are 0.01.
+        assert planner.telling(Plan(BASE, 128, "half"), times) == pytest.approx(decided, abs=0.01), room
+
+
+def test_a_surer_plan_is_one_that_is_expected_to_keep_all_limits() -> None:
+    error = world(BASE).errors[-1]
+
+    def surer(**limits: float) -> Plan | None:
+        planner = Planner(BASE, VALUES, BASES, ("half", "float"), limits)
+        planner.add(world(BASE))
+        return planner.surer(Plan(BASE, 128, "half"))
+
+    plan = surer(relative_rmse=error)
+    assert plan is not None
+    assert plan.place != BASE
+    planner = Planner(BASE, VALUES, BASES, ("half", "float"), {"relative_rmse": error})
+    planner.add(world(BASE))
+    assert planner.guesses(plan)["relative_rmse"].mean < np.log(error) - 0.05
+    assert surer(relative_rmse=1.5 * error) is None, "it is sure already"
+    assert surer(relative_rmse=0.1 * error) is None, "nothing comes near"
+    baked = world(BASE).bake_seconds
+    dear = surer(relative_rmse=error, bake_seconds=1.05 * baked)
+    assert dear is None or dear.place[1] <= BASE[1] or dear.place[2] > BASE[2], "what errs less takes longer in other ways"
+    assert surer(relative_rmse=error, bake_seconds=0.1 * baked) is None
+    assert surer(relative_rmse=error, megabytes=1e-3) is None
+
+
+def test_what_all_places_cost_is_what_was_measured_and_what_is_expected() -> None:
+    planner = Planner(BASE, VALUES, BASES, ("half",), {"relative_rmse": 0.1})
+    for place in product(*VALUES):
+        planner.add(world(place))
+    places = [*product(*VALUES)]
+    exact = [world(place).bake_seconds + world(place).fit_seconds for place in places]
+    assert planner.cost_of_all() == pytest.approx(sum(exact), rel=1e-9)
+    few = Planner(BASE, VALUES, BASES, ("half",), {"relative_rmse": 0.1})
+    few.add(world(BASE))
+    assert few.cost(BASE) == pytest.approx(exact[places.index(BASE)], rel=1e-9)
+    assert sum(exact) / 2 < few.cost_of_all() < 2 * sum(exact), "by exponents that are not this world's"
+    few.barred = {*places[1:]} - {BASE}
+    assert few.cost_of_all() == pytest.approx(few.cost(BASE) + few.cost(places[0]), rel=1e-9)
+
+
+def test_a_time_on_a_busy_machine_is_an_interval() -> None:
+    for off in (0.0, 0.03, 0.2):
+        planner = Planner(BASE, VALUES, BASES, ("half",), {"frame_us": 1.0})
+        planner.add(replace(world(BASE), frame_spread=(off,) * len(LADDER)))
+        assert planner.guesses(Plan(BASE, 128, "half"))["frame_us"].spread == max(off, 0.03)
+        assert planner.guesses(Plan((*BASE[:2], 0.02, BASE[3]), 128, "half"))["frame_us"].spread >= max(off, 0.08)
+        size = planner.guesses(Plan(BASE, 128, "half"))["megabytes"]
+        assert np.exp(size.chance(1.0001 * np.exp(size.mean))) > 0.99, "bytes that were counted are no interval"
 
 
 @pytest.mark.parametrize(("knob", "more"), [("atlas.resolution", False), ("points.count", True), ("lightings.train", False)])

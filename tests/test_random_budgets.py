@@ -11,8 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ddprt.bench.measure.settings import Setting
 from ddprt.bench.peers import roofline
-from ddprt.bench.tune.planner import Place, Trial
+from ddprt.bench.tune.outcome import Doubt, Outcome
+from ddprt.bench.tune.planner import Place, Plan, Trial
 from ddprt.bench.tune.search import Search
 from ddprt.errors import UserError
 
@@ -27,6 +29,7 @@ TRIAL = Trial(
     0.05,
     0.0,
     (50.0, 80.0, 200.0),
+    (0.03, 0.03, 0.03),
     {"half": (0.1, 0.4, 1.6), "float": (0.2, 0.8, 3.2)},
     3.0,
     0.5,
@@ -119,6 +122,28 @@ def test_an_error_is_pooled_over_the_first_or_all() -> None:
     tally = frontier.Tally(error, error, mean, mean, np.ones(3, np.float32))
     assert frontier.pooled(tally) == pytest.approx(np.sqrt(10) / 4)
     assert frontier.pooled(tally, 2) == pytest.approx(np.sqrt(2.5) / 2)
+
+
+@pytest.mark.parametrize("met", [True, False])
+@pytest.mark.parametrize(("truth", "held"), [(0.2, True), (0.16, True), (0.14, False), (0.26, False)])
+def test_an_answer_that_cannot_be_shown_is_no_hit(
+    met: bool, truth: float, held: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """But held, where what is in doubt lies within the bounds that were told; whichever side of the limit that is."""
+    contest = frontier.Contest("cornell", tmp_path, quick=True)
+    limits = {"relative_rmse": 0.21, "frame_us": 80.0, "megabytes": 1.0, "bake_seconds": 9.0}
+    plan, setting = Plan(TRIAL.place, 4, "half"), Setting({}, contest.base)
+    doubt = Doubt(plan, setting, 0.5, "relative_rmse", 0.2, 0.15, 0.25)
+    outcome = Outcome(plan, {}, 0.5, met, doubt, "relative_rmse", 2, 32, setting, limits)
+    flat = np.ones((3, 3))
+    tally = frontier.Tally(np.full(3, truth**2), np.ones(3), flat, flat, np.ones(3, np.float32))
+    monkeypatch.setattr(Search, "run", lambda _: outcome)
+    monkeypatch.setattr(frontier.Contest, "_tally", lambda *_: tally)
+    monkeypatch.setattr(frontier.Contest, "_frame_us", lambda *_: 90.0)
+    answer = contest._answer(limits, {})
+    assert (answer["right"], answer["undecided"], answer["held"]) == (False, True, held)
+    assert answer["frame_beyond"] == met, "of settings that are said to do"
+    assert answer["within"] == pytest.approx(0.2 / 0.15 - 1)
 
 
 def test_a_resolution_that_cannot_be_unwrapped_is_left_out_and_told_once(

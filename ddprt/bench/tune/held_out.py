@@ -36,7 +36,7 @@ class HeldOut:
     workshop: Workshop
     seconds: float = field(default=0.0, init=False)
     _more: list[Yardstick] = field(default_factory=list, init=False)
-    _last: float = field(default=0.0, init=False)
+    _each: float = field(default=0.0, init=False)
 
     @property
     def count(self) -> int:
@@ -47,18 +47,19 @@ class HeldOut:
         """Errors of a model under all of them."""
         return Tally.joined([yardstick.tally(model) for yardstick in (self.workshop.yardstick, *self._more)])
 
-    def more(self, limit: float, allowance: float) -> bool:
-        """Doubles them, where that is possible and costs no more than is allowed.
+    def more(self, limit: float, allowance: float, times: int = 2) -> bool:
+        """Draws some more, where that is possible and costs no more than is allowed.
 
         Args:
           limit: the error that is to be told from what is beyond it; held-out maps are baked as finely as that takes.
-          allowance: seconds that more lightings may take, all in all. The first doubling takes about what the lightings of the
-            configuration took, and is never too dear; each one after it is expected to take twice the one before.
+          allowance: seconds that more lightings may take, all in all. Those drawn first are never too dear, since what they
+            take is not known yet; after that a lighting is expected to take as long as one did the last time.
+          times: how many times as many there are then.
         Returns:
           Whether there are more; never where they come from a file, which has no others.
         """
-        config, count = self.workshop.config, self.count
-        if config.lightings.file or (self._more and self.seconds + 2 * self._last > allowance):
+        config, count = self.workshop.config, (times - 1) * self.count
+        if config.lightings.file or (self._more and self.seconds + count * self._each > allowance):
             return False
         noise = max(config.bench.noise, float(f"{min(1.0, _SHARE * limit):.1g}"))
         changes = {
@@ -66,7 +67,7 @@ class HeldOut:
             "lightings": config.lightings.model_copy(update={"test": count}),
             "bench": config.bench.model_copy(update={"noise": noise, "path_frames": 0, "pictures": 0}),
         }
-        folder = self.workshop.folder / f"truth-{self.workshop.truth}-{count}-{noise:g}"
+        folder = self.workshop.folder / f"truth-{self.workshop.truth}-{len(self._more)}-{count}-{noise:g}"
         self.workshop.progress.say(f"{count} more held-out lightings, to tell whether the error is within its limit")
         begun = time.perf_counter()
         found = make_yardstick(self.workshop.scene, config.model_copy(update=changes), folder, self.workshop.progress)
@@ -76,7 +77,7 @@ class HeldOut:
         else:
             write_text(told, json.dumps({"seconds": round(took, 4), "environment": here()}) + "\n")
         self._more.append(found)
-        self.seconds, self._last = self.seconds + took, took
+        self.seconds, self._each = self.seconds + took, took / count
         return True
 
 

@@ -8,12 +8,12 @@ depends on the bases alone and the rest, what even all bases leave, is a power l
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from math import exp, log
 
 import numpy as np
-from scipy.special import log_ndtr
+from scipy.special import log_ndtr, ndtr, ndtri
 
 from ddprt.axes import Float64
 
@@ -21,10 +21,13 @@ QUANTITIES = ("relative_rmse", "frame_us", "megabytes", "bake_seconds", "fit_sec
 """What a budget may limit."""
 KNOBS = ("atlas.resolution", "lightings.train", "transport.target_noise", "points.count")
 """Dear knobs, each of which asks for another bake."""
-_SURE = 0.9  # chance of meeting a limit from which a plan counts as safe
-_HOPELESS = 0.02
+SURE = 0.9
+"""Chance of meeting a limit from which a plan counts as safe."""
+HOPELESS = 0.02
+"""Chance below which it counts as out of reach."""
 _WORTHWHILE = 0.05  # promised fall of the error, in logarithms, that another bake is made for
 _AGAIN = 0.03  # by how much a measurement differs when it is made again, in logarithms
+_BETTER = 0.05  # by how much another setting has to be likelier that is baked although one was found within the limits
 _TINY = 1e-12
 _FREE = 3.0  # standard deviation of a constant that nothing is known of, in logarithms
 
@@ -61,7 +64,10 @@ class Trial:
       bases: numbers of bases that were scored, rising.
       errors: relative RMSE at each.
       error_spread, error_skew: of its logarithm over held-out lightings, see `ddprt.bench.tune.held_out.spread_of`.
-      frame_us, megabytes: at each, by precision.
+      frame_us: at each, the median of some frames.
+      frame_spread: of its logarithm, at each: a median's standard deviation as far as it can be told, see `spread_of_time`
+        in `ddprt.bench.tune.curves`.
+      megabytes: at each, by precision.
       bake_seconds, fit_seconds: of the whole.
     """
 
@@ -71,6 +77,7 @@ class Trial:
     error_spread: float
     error_skew: float
     frame_us: tuple[float, ...]
+    frame_spread: tuple[float, ...]
     megabytes: dict[str, tuple[float, ...]]
     bake_seconds: float
     fit_seconds: float
@@ -98,6 +105,12 @@ class Guess:
         """
         t, skew = (self.mean - log(limit)) / max(self.spread, 1e-6), self.skew
         return float(log_ndtr(-(t + skew * t**2 / 3 + skew**2 * t**3 / 27 + skew / 6)))
+
+    def quantile(self, chance: float) -> float:
+        """The limit that it is within by so much of a chance: what `chance` does, turned about."""
+        x, skew = -float(ndtri(chance)), self.skew
+        t = 3 / skew * float(np.cbrt(1 + skew * (x - skew / 6)) - 1) if abs(skew) > 1e-6 else x
+        return exp(self.mean - max(self.spread, 1e-6) * t)
 
 
 @dataclass(frozen=True)
@@ -220,11 +233,58 @@ class Planner:
             return False
         others = [name for name in self.limits if name != "relative_rmse"]
         within = all(guesses[name].mean <= log(self.limits[name]) for name in others)
-        return within and log(_HOPELESS) < error.chance(limit) < log(1 - _HOPELESS)
+        return within and log(HOPELESS) < error.chance(limit) < log(1 - HOPELESS)
+
+    def telling(self, plan: Plan, times: int = 2) -> float:
+        """Chance that so many times as many held-out lightings decide about a plan whose error has a limit.
+
+        They divide the square of the spread by as much, and by the rest of it the mean may move. In units of the new spread,
+        the room t to the limit becomes a Gaussian about sqrt(times) t, of standard deviation sqrt(times - 1), without skew.
+        """
+        error = self.guesses(plan)["relative_rmse"]
+        room = np.sqrt(times) * (log(self.limits["relative_rmse"]) - error.mean) / error.spread
+        moved = np.sqrt(times - 1)
+        return float(ndtr((room - ndtri(SURE)) / moved) + ndtr((ndtri(HOPELESS) - room) / moved))
+
+    def surer(self, plan: Plan) -> Plan | None:
+        """A plan elsewhere that is likelier to meet the budget than one that was tried, should all be as expected there.
+
+        What is not tried is known less well, so that it rarely looks likelier as it stands. Here it is taken for known as well
+        as what was tried.
+
+        Returns:
+          The likeliest; None where none would be sure, or likelier by a twentieth, and where the plan is sure already.
+        """
+        known = self.guesses(plan)
+        before, found, most = exp(_likely(known, self.limits)), None, 0.0
+        if before >= SURE:
+            return None
+        tried = {trial.place for trial in self.trials}
+        for place in product(*self.values):
+            if place in self.barred or place in tried:
+                continue
+            told = self._of_place(place)
+            for bases, precision in product(self.bases, self.precisions):
+                expected = self._guesses(told, bases, precision)
+                likely = exp(_likely({name: replace(known[name], mean=expected[name].mean) for name in known}, self.limits))
+                if likely > most:
+                    found, most = Plan(place, bases, precision), likely
+        return found if most >= min(before + _BETTER, SURE) else None
+
+    def cost(self, place: Place) -> float:
+        """Seconds of a bake and a fit, as measured or else as expected."""
+        _, known, laws, _ = self._of_place(place)
+        if known:
+            return next(seconds(trial) for trial in self.trials if trial.place == place)
+        return exp(laws["bake_seconds"].mean) + exp(laws["fit_seconds"].mean)
+
+    def cost_of_all(self) -> float:
+        """Seconds that it would take to try every place that can be baked."""
+        return sum(self.cost(place) for place in product(*self.values) if place not in self.barred)
 
     def hopeless(self, chance: float) -> bool:
         """Whether a chance is too small to go on."""
-        return len(self.trials) > 1 and chance < _HOPELESS
+        return len(self.trials) > 1 and chance < HOPELESS
 
     def binding(self) -> str:
         """The limit without which the rest of the budget would be met most easily."""
@@ -256,7 +316,7 @@ class Planner:
         if elsewhere is None:
             return there
         promised = elsewhere[0][2] - there[0][2]
-        safe = there[0][0] == log(_SURE) and ("relative_rmse" in limits or promised < _WORTHWHILE)
+        safe = there[0][0] == log(SURE) and ("relative_rmse" in limits or promised < _WORTHWHILE)
         return there if safe or there[0] >= elsewhere[0] else elsewhere
 
     def _of_place(self, place: Place) -> tuple[Trial, bool, dict[str, Guess], dict[str, float]]:
@@ -279,17 +339,22 @@ class Planner:
             whole = float(np.hypot(spread, rest / error**2 * laws["rest"].spread))
             spread, skew = whole, skew * (spread / whole) ** 3  # third moments add up, and a law's is 0
         found = {"relative_rmse": Guess(log(max(error, _TINY)), max(spread, 1e-3), skew)}
+        off = {"frame_us": max(_AGAIN, _between(trial.bases, trial.frame_spread, bases)), "megabytes": 0.0}  # bytes are counted
         for name, curve in (("frame_us", trial.frame_us), ("megabytes", trial.megabytes[precision])):
             certain = known and bases in trial.bases
-            found[name] = Guess(
-                log(_between(trial.bases, curve, bases)) + moved[name], _AGAIN if certain else laws[name].spread
-            )
+            farther = off[name] if certain else max(off[name], laws[name].spread)
+            found[name] = Guess(log(_between(trial.bases, curve, bases)) + moved[name], farther)
         for name in ("bake_seconds", "fit_seconds"):
             found[name] = Guess(log(getattr(trial, name)), _AGAIN) if known else laws[name]
         return found
 
     def _row(self, place: Place) -> np.ndarray:
         return np.concatenate([[1.0], np.log(np.array(place) / np.array(self.base))])
+
+
+def seconds(trial: Trial) -> float:
+    """What a place cost: its bake, and one fit."""
+    return trial.bake_seconds + trial.fit_seconds
 
 
 def _likely(guesses: Mapping[str, Guess], limits: Mapping[str, float]) -> float:
@@ -305,7 +370,7 @@ def _rank(guesses: Mapping[str, Guess], limits: Mapping[str, float]) -> Rank:
     likely = _likely(guesses, limits)
     beyond = sum(max(guesses[name].mean - log(limit), 0.0) for name, limit in limits.items())
     least = "bake_seconds" if "relative_rmse" in limits else "relative_rmse"
-    return min(max(likely, log(_HOPELESS)), log(_SURE)), -beyond if likely < log(_HOPELESS) else 0.0, -guesses[least].mean
+    return min(max(likely, log(HOPELESS)), log(SURE)), -beyond if likely < log(HOPELESS) else 0.0, -guesses[least].mean
 
 
 def _told(name: str, trial: Trial) -> float:

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -12,14 +12,16 @@ import numpy as np
 from ddprt.bench.measure.settings import Setting, changed
 from ddprt.bench.measure.timing import timed
 from ddprt.bench.measure.trial import Workshop, about, environment, why
+from ddprt.bench.tune.curves import first_bases, time_of_frame, with_measured, without_last
 from ddprt.bench.tune.held_out import HeldOut, error_of, spread_of
-from ddprt.bench.tune.planner import KNOBS, QUANTITIES, Place, Plan, Planner, Trial
+from ddprt.bench.tune.knobs import FACTORS, around, value_of
+from ddprt.bench.tune.outcome import UNITS, Doubt, Outcome
+from ddprt.bench.tune.planner import HOPELESS, KNOBS, QUANTITIES, SURE, Place, Plan, Planner, Trial, seconds
 from ddprt.config import Config
 from ddprt.dataset.forecast import forecast
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.files import alone_in, append_line, make_folder, write_text
-from ddprt.methods.svd_ridge import LinearTransfer
 from ddprt.runtime.model import Model
 from ddprt.runtime.precision import shipped_bytes, stored
 from ddprt.runtime.train import fit_config
@@ -27,43 +29,10 @@ from ddprt.runtime.train import fit_config
 BASES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
 _SCORED = (1, 2, 4, 8, 16, 32, 64, 128)
 _PRECISIONS = ("half", "float")
-FACTORS: dict[str, tuple[float, ...]] = {
-    "atlas.resolution": (0.25, 0.5, 2**-0.5, 1.0),
-    "lightings.train": (0.125, 0.25, 0.5, 1.0, 2.0),
-    "transport.target_noise": (0.5, 1.0, 2.0, 4.0, 8.0),
-    "points.count": (0.5, 1.0, 2.0, 4.0),
-}
-_LEAST = {"atlas.resolution": 16, "lightings.train": 4, "transport.target_noise": 1e-3, "points.count": 4}
-_SURE = 0.9
-_FRAMES = 50  # timings of a frame
-UNITS = {"relative_rmse": "", "frame_us": " µs", "megabytes": " MB", "bake_seconds": " s", "fit_seconds": " s"}
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What came of a search.
-
-    Attributes:
-      plan: the best that was tried.
-      reached: each of `QUANTITIES`, as measured.
-      chance: that lightings of another seed are within the limits, too.
-      met: whether the budget is met.
-      binding: the limit that stands in the way, or that was met with the least room.
-      trials: bakes that were made.
-      held_out: lightings that the error was told on.
-      setting: the plan as a configuration.
-      limits: what was asked for.
-    """
-
-    plan: Plan
-    reached: dict[str, float]
-    chance: float
-    met: bool
-    binding: str
-    trials: int
-    held_out: int
-    setting: Setting
-    limits: dict[str, float]
+_SHARE = 0.1  # of what it costs to try all places, beyond which nothing more is tried
+_FEW = 3  # bakes that are made whatever they cost
+_LIGHTINGS = 2.0  # times what the trials took, beyond which no more held-out lightings are drawn
+_PAYS = 0.2  # chance that more held-out lightings decide, below which they are not drawn
 
 
 class Search:
@@ -99,8 +68,8 @@ class Search:
             raise UserError(f'fit.method: got "{config.fit.method}", expected "svd-ridge", whose bases are counted; set it')
         workshop.check(config)
         self.config, self.workshop = config, workshop
-        self.base: Place = tuple(float(_value(config, knob)) for knob in KNOBS)
-        values = [_around(config, knob, base, factors[knob]) for knob, base in zip(KNOBS, self.base, strict=True)]
+        self.base: Place = tuple(float(value_of(config, knob)) for knob in KNOBS)
+        values = [around(config, knob, base, factors[knob]) for knob, base in zip(KNOBS, self.base, strict=True)]
         self._known = measure or self.measure
         self._expected = expected
         self.bases = tuple(
@@ -126,10 +95,11 @@ class Search:
             if self._more_lightings(plan if tried else self._best_tried()):
                 verified.clear()
                 continue
-            if tried or planner.hopeless(chance) or len(planner.trials) + self._failed >= self.config.tune.trials:
+            found = None if planner.hopeless(chance) else self._elsewhere(None if tried else plan, chance)
+            if found is None or not self._affords(found.place):
                 break
-            progress.say(f"next: {self._name(plan.place)}, a chance of {chance:.0%}")
-            self._tried(plan.place)
+            progress.say(f"next: {self._name(found.place)}, a chance of {self._chance(found):.0%}")
+            self._tried(found.place)
         plan = self._best_tried()
         if plan not in verified:  # a better one lies where no trial may be made any more
             verified[plan] = self._verify(plan)
@@ -138,20 +108,67 @@ class Search:
         room = {name: limit / reached[name] for name, limit in self.limits.items()}
         binding = min(room, key=lambda name: room[name]) if met else planner.binding()
         trials, lightings = len(planner.trials), self.held_out.count
-        return Outcome(plan, reached, chance, met, binding, trials, lightings, self.setting(plan), self.limits)
+        doubt = self._doubt(plan if met or chance >= HOPELESS else planner.next()[0], met)
+        return Outcome(plan, reached, chance, met, doubt, binding, trials, lightings, self.setting(plan), self.limits)
+
+    def _elsewhere(self, plan: Plan | None, chance: float) -> Plan | None:
+        """The plan to bake for next, if any is worth it.
+
+        Where what was tried may do, for all that can be told, another place is only baked if it promises more: being as likely
+        again is to throw the same dice once more.
+
+        Args:
+          plan: elsewhere, the likeliest; None where one that was tried is.
+          chance: of the likeliest.
+        """
+        best = self._best_tried()
+        before = self._chance(best)
+        if plan is not None and (not HOPELESS <= before < SURE or chance > 2 * before):
+            return plan
+        return self.planner.surer(best)
+
+    def _affords(self, place: Place) -> bool:
+        """Whether one more bake is allowed: of so many, and with all before it for a share of what all places cost."""
+        planner = self.planner
+        if len(planner.trials) + self._failed >= self.config.tune.trials:
+            return False
+        spent = sum(map(seconds, planner.trials)) + self.held_out.seconds
+        return len(planner.trials) < _FEW or spent + planner.cost(place) <= self._allowed()
+
+    def _allowed(self) -> float:
+        """Seconds that a search may take: a share of what all places are expected to, or a few bakes where that is more."""
+        return max(_SHARE * self.planner.cost_of_all(), _FEW * max(map(seconds, self.planner.trials)))
+
+    def _doubt(self, plan: Plan, met: bool) -> Doubt | None:
+        """What is open about the likeliest plan; None where it is sure that it is within the limits, or out of reach."""
+        guesses, chance = self.planner.guesses(plan), self._chance(plan)
+        if chance >= SURE if met else chance < HOPELESS:
+            return None
+        quantity = min(self.limits, key=lambda name: guesses[name].chance(self.limits[name]))
+        guess = guesses[quantity]
+        low = guess.quantile(min(1 - SURE, float(np.exp(guess.chance(self.limits[quantity])))))
+        high = guess.quantile(SURE)
+        return Doubt(plan, self.setting(plan), chance, quantity, float(np.exp(guess.mean)), low, high)
 
     def _more_lightings(self, plan: Plan) -> bool:
-        """Doubles the held-out lightings if that may decide about a plan, and scores all that was tried on them.
+        """Draws more held-out lightings if that may decide about a plan, and scores all that was tried on them.
 
-        They never cost more than the trials have: another trial is what they are drawn in place of.
+        They never cost more than twice what the trials have, nor bring the whole beyond its share. After the first time they
+        have to promise that they decide. Twice as many are drawn where these are likely to, else four times as many, since each
+        bake costs something for itself.
         """
-        if not self.planner.undecided(plan):
+        planner = self.planner
+        if not planner.undecided(plan):
             return False
-        spent = sum(trial.bake_seconds + trial.fit_seconds for trial in self.planner.trials)
-        if not self.held_out.more(self.limits["relative_rmse"], spent):
+        times = 2 if planner.telling(plan) > 0.5 else 4
+        if self.held_out.seconds and planner.telling(plan, times) < _PAYS:
             return False
-        for trial in self.planner.trials:
-            self.planner.replace(self._scored_again(trial))
+        tried = sum(map(seconds, planner.trials))
+        left = self._allowed() - tried
+        if left <= 0 or not self.held_out.more(self.limits["relative_rmse"], min(_LIGHTINGS * tried, left), times):
+            return False
+        for trial in planner.trials:
+            planner.replace(self.scored_again(trial))
         return True
 
     def _start(self) -> Place:
@@ -213,13 +230,15 @@ class Search:
         shorter = [first_bases(model, count) for count in sizes]
         errors, spread, skew = self._curve(model, sizes)
         values = data.values(data.split("train")[:1], model.points, model.quantity)[0]
+        frames = [time_of_frame(one, values) for one in shorter]
         trial = Trial(
             place,
             tuple(sizes),
             errors,
             spread,
             skew,
-            tuple(_frame_us(one, values) for one in shorter),
+            tuple(frame for frame, _ in frames),
+            tuple(off for _, off in frames),
             {name: tuple(shipped_bytes(one, name) / 1e6 for one in shorter) for name in _PRECISIONS},
             baked["seconds"],
             fitted,
@@ -234,7 +253,7 @@ class Search:
         tallies = [self.held_out.tally(stored(without_last(model, most - count), "half")) for count in sizes]
         return tuple(map(error_of, tallies)), *spread_of(tallies[-1])
 
-    def _scored_again(self, trial: Trial) -> Trial:
+    def scored_again(self, trial: Trial) -> Trial:
         """The same with its errors on all held-out lightings there are now."""
         setting = self.setting(Plan(trial.place, max(BASES), "float"))
         data, _ = self.workshop.bake(setting)
@@ -249,16 +268,19 @@ class Search:
         model = stored(model, plan.precision)
         values = data.values(data.split("train")[:1], model.points, model.quantity)[0]
         tally = self.held_out.tally(model)
+        known = next(trial for trial in reversed(self.planner.trials) if trial.place == plan.place)
+        curves = zip(known.bases, known.frame_us, known.frame_spread, strict=True)
+        before = [(taken, spread) for bases, taken, spread in curves if bases == plan.bases]
+        frame, off = time_of_frame(model, values, limit=self.limits.get("frame_us"), before=before)
         reached = {
             "relative_rmse": error_of(tally),
-            "frame_us": _frame_us(model, values),
+            "frame_us": frame,
             "megabytes": shipped_bytes(model, plan.precision) / 1e6,
             "bake_seconds": float(baked["seconds"]),
             "fit_seconds": fitted,
         }
-        known = next(trial for trial in reversed(self.planner.trials) if trial.place == plan.place)
         self.planner.trials.remove(known)
-        self.planner.add(with_measured(known, plan, reached, *spread_of(tally)))
+        self.planner.add(with_measured(known, plan, reached, *spread_of(tally), off))
         return reached
 
     def _fit(self, setting: Setting, data: Dataset) -> tuple[Model, float]:
@@ -315,44 +337,6 @@ def tune(config: Config, folder: Path, progress: Any) -> Outcome:
     return outcome
 
 
-def first_bases(model: Model, count: int) -> Model:
-    """The model with its first bases alone; a mean counts as one of them."""
-    linear = model.relighter
-    assert isinstance(linear, LinearTransfer), "the planner fits svd-ridge"
-    report = linear.report
-    kept = count - (report.bases - len(linear.basis))
-    shorter = replace(linear, matrix=linear.matrix[:, :kept], intercept=linear.intercept[:, :kept], basis=linear.basis[:kept])
-    return replace(model, relighter=replace(shorter, report=replace(report, bases=count)))
-
-
-def without_last(model: Model, count: int) -> Model:
-    """The same with its last bases black: shapes stay, so that nothing compiles again."""
-    linear = model.relighter
-    assert isinstance(linear, LinearTransfer), "the planner fits svd-ridge"
-    return replace(model, relighter=linear.truncated(len(linear.basis) - count))
-
-
-def with_measured(trial: Trial, plan: Plan, reached: dict[str, float], spread: float, skew: float) -> Trial:
-    """A trial with one more number of bases on its curves, or with another value there."""
-    rows = {
-        bases: (error, frame, {name: sizes[i] for name, sizes in trial.megabytes.items()})
-        for i, (bases, error, frame) in enumerate(zip(trial.bases, trial.errors, trial.frame_us, strict=True))
-    }
-    between = {name: float(np.interp(plan.bases, trial.bases, sizes)) for name, sizes in trial.megabytes.items()}
-    rows[plan.bases] = reached["relative_rmse"], reached["frame_us"], {**between, plan.precision: reached["megabytes"]}
-    order: Sequence[int] = sorted(rows)
-    return replace(
-        trial,
-        bases=tuple(order),
-        errors=tuple(rows[bases][0] for bases in order),
-        error_spread=spread,
-        error_skew=skew,
-        frame_us=tuple(rows[bases][1] for bases in order),
-        megabytes={name: tuple(rows[bases][2][name] for bases in order) for name in trial.megabytes},
-        fit_seconds=reached["fit_seconds"],
-    )
-
-
 def told(outcome: Outcome) -> str:
     """The trade that was made, as a table and a sentence."""
     lines = [f"{'':<16}{'reached':>12}{'limit':>12}"]
@@ -361,33 +345,18 @@ def told(outcome: Outcome) -> str:
         lines.append(f"{name:<16}{f'{outcome.reached[name]:.4g}{UNITS[name]}':>12}{limit:>12}")
     setting = f"{outcome.setting.name}, after {outcome.trials} bakes, on {outcome.held_out} held-out lightings"
     if outcome.met:
-        lines.append(f"meets the budget: {setting}; the least room is left by {outcome.binding}")
-        if outcome.chance < _SURE:
-            lines.append(f"just so: other lightings may be beyond it (a chance of {outcome.chance:.0%} that they are not)")
-    else:
+        sure = outcome.doubt is None
+        lines.append(f"{'meets' if sure else 'may meet'} the budget: {setting}; the least room is left by {outcome.binding}")
+    elif outcome.doubt is None:
         lines.append(f"no setting meets the budget; {outcome.binding} stands in the way; nearest: {setting}")
+    else:
+        lines.append(f"no setting is known to meet the budget; nearest: {setting}")
+    if doubt := outcome.doubt:
+        name, unit = doubt.quantity, UNITS[doubt.quantity]
+        lines.append(
+            f"undecided within {doubt.within:.0%}, it cannot be shown: {name} lies at {doubt.expected:.3g}{unit}, between "
+            f"{doubt.low:.3g} and {doubt.high:.3g}, the limit is {outcome.limits[name]:.3g}"
+        )
+        which = "" if doubt.plan == outcome.plan else f" with {doubt.setting.name}"
+        lines.append(f"the chance that the limits are kept{which} is {doubt.chance:.0%}")
     return "\n".join(lines)
-
-
-def _value(config: Config, knob: str) -> float:
-    section, key = knob.split(".")
-    return float(getattr(getattr(config, section), key))
-
-
-def _around(config: Config, knob: str, base: float, factors: Sequence[float]) -> tuple[float, ...]:
-    """What a knob may be; alone what it is where it has no effect."""
-    still = (knob == "transport.target_noise" and config.transport.samples != "auto") or (
-        knob == "points.count" and bool(config.points.file)
-    )
-    if still or (knob == "lightings.train" and config.lightings.file):
-        return (base,)
-    steps = {max(_LEAST[knob], factor * base) for factor in factors if factor != 1}
-    if knob == "transport.target_noise":
-        return tuple(sorted({base, *(min(1.0, float(f"{step:.3g}")) for step in steps)}))
-    if knob == "atlas.resolution":
-        return tuple(sorted({base, *(step for each in steps if (step := float(8 * round(each / 8))) < base)}))
-    return tuple(sorted({base, *(float(round(step)) for step in steps)}))
-
-
-def _frame_us(model: Model, values: np.ndarray) -> float:
-    return 1e6 * timed(lambda: model.predict(values), _FRAMES)[1].median
