@@ -124,8 +124,8 @@ def test_each_order_of_gloss_is_a_stage_of_its_own(bounces: int, tmp_path: Path)
 
 
 def test_rays_of_gloss_are_chosen_in_what_stands_in_for_the_maps(tmp_path: Path) -> None:
-    """As many as the square of the mean light says: 5 % of it, which is what the vase reflects, are 10 % of the rays. With direct
-    light alone they are further off."""
+    """As many as the square of the mean light says: 5 % of it, which is what the vase reflects, are 10 % of the rays.
+    With direct light alone they are further off."""
     transport = {"samples": 32, "test_samples": "auto", "target_noise": 0.1}
     config = config_of("glossy-room", 32, lightings={"clearance": 0.1}, transport=transport)
     found, stages = baked(gilded("gilt", roughness=0.6), config, tmp_path)
