@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from safetensors.numpy import load_file
+from small_job import call
 
 import ddprt
 from ddprt.config import checked as configured
@@ -20,7 +21,7 @@ from ddprt.sampling.points import place_samples
 from ddprt.scene.atlas import SHUT, build_atlas
 from ddprt.scene.checks import checked
 from ddprt.scene.holes import Holes
-from ddprt.scene.library import build
+from ddprt.scene.library import SCENES, build
 from ddprt.scene.material import Cutout, Material, bilinear
 from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import faceted, hollow
@@ -344,6 +345,26 @@ def test_models_and_datasets_carry_the_holes(tmp_path: Path) -> None:
     assert open_dataset(tmp_path / "data").holes is not None
     with pytest.raises(ddprt.UserError, match=r"scene\.digest"):
         ddprt.bake(force(scene, off=["cut-outs"]), lightings, config=CONFIG, out=tmp_path / "data")
+
+
+def test_a_scene_that_is_all_holes_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    bare = Cutout(np.zeros((2, 2), np.float32))
+    vanished = stack([0.0, 0.5], None).made_of(lambda material: replace(material, cutout=bare))
+    words = "nothing of the scene is left to light, expected some surface"
+    with pytest.raises(ddprt.UserError, match=f"stack: got .*{words}"):
+        build_open_atlas(Tracer.of(vanished), vanished, 32)
+    whole = force(vanished, off=["cut-outs"])
+    assert build_open_atlas(Tracer.of(whole), whole, 32)[0].count
+    monkeypatch.setitem(SCENES, "vanished", lambda: vanished)
+    smoke = Path(__file__).parent.parent / "configs" / "smoke.toml"
+    bake = ["bake", smoke, "--scene.name", "vanished", "--lightings.distribution", "around", "--out", tmp_path / "run"]
+    for verb in (["inspect", "vanished", "--atlas.resolution", "32"], bake, [*bake, "--dry-run"]):
+        assert call(*verb) == 2
+        told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("ddprt: ")]
+        assert len(told) == 1
+        assert words in told[0]
 
 
 def test_without_holes_files_are_what_they_were(tmp_path: Path) -> None:

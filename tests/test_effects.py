@@ -293,6 +293,46 @@ def test_what_cannot_be_forced_is_refused_in_one_line(name: str, capsys: pytest.
         assert expected in lines[0]
 
 
+@pytest.mark.parametrize("way", ["on", "off"])
+def test_one_name_alone_is_no_list_of_names(way: str, cornell: Scene) -> None:
+    with pytest.raises(UserError, match=rf"effects\.{way}: got 'gloss', expected a list of names; write {way}=\[\"gloss\"\]"):
+        force(cornell, **{way: "gloss"})
+
+
+def test_what_types_rule_out_is_refused_in_one_line_too() -> None:
+    """In a process of its own, where nothing but the functions themselves looks at types."""
+    code = """
+import ddprt
+from ddprt.lights import parse_lighting
+from ddprt.scene.library import build
+scene, lamp = build("plates"), {"type": "point", "position": [0, 0, 1], "intensity": [1, 1, 1]}
+light = parse_lighting(lamp)[0]
+tries = [lambda: ddprt.force(scene, off=None), lambda: ddprt.force(scene, on=[["gloss"]])]
+tries += [lambda given=given: ddprt.plan(scene, given) for given in (lamp, light, None, "lamps.json")]
+for one in tries:
+    try:
+        print("accepted", one())
+    except ddprt.UserError as error:
+        print(error)
+assert ddprt.plan(scene, [lamp]).called("point lights")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stderr == ""
+    names = 'expected a list of names; write {0}=["gloss"] or the like'
+    lightings = "lightings: got {0}, expected a list of lightings; put one alone in brackets"
+    assert done.stdout.splitlines() == [
+        f"effects.off: got None, {names.format('off')}",
+        f"effects.on: got [['gloss']], {names.format('on')}",
+        *(lightings.format(kind) for kind in ("dict", "PointLight", "NoneType", "str")),
+    ]
+
+
+def test_bounces_below_what_lets_the_scene_decide_are_refused(cornell: Scene) -> None:
+    with pytest.raises(UserError, match=r"bounces: got -5, expected 0 and up, or -1; leave it out"):
+        plan(cornell, [LAMP], bounces=-5)
+    assert plan(cornell, [LAMP], bounces=-1) == plan(cornell, [LAMP])
+
+
 def test_every_effect_is_forceable_or_refused(cornell: Scene) -> None:
     for name in EFFECTS:
         for way in ("on", "off"):

@@ -6,10 +6,12 @@ import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from small_job import call
 
 import ddprt
 from ddprt import seeds
@@ -359,6 +361,27 @@ def test_probes_in_solids_take_the_light_of_the_nearest_free_one() -> None:
     np.testing.assert_allclose(ProbeGrid.of(layer).at(light, [[0.0, 3.0, 1.0]]), 1.5)
 
 
+@pytest.mark.parametrize(
+    ("position", "fault"),
+    [
+        ([[0.0, 3.0, 1.0], [0.0, float("nan"), 1.0]], r"position\[1\]: got \[0.0, nan, 1.0\]"),
+        ([0.0, 3.0, 1.0], r"position: got shape \(3,\), expected \(n, 3\)"),
+        ([[0.0, 3.0]], r"position: got shape \(1, 2\), expected \(n, 3\)"),
+        ([[0.0, 3.0, 1.0, 9.0]], r"position: got shape \(1, 4\), expected \(n, 3\)"),
+        ([[0.0], [3.0, 1.0]], "position: got no array of numbers"),
+    ],
+)
+def test_light_is_looked_up_at_positions_alone(position: list[Any], fault: str) -> None:
+    with pytest.raises(UserError, match=fault):
+        ProbeGrid.of(grid()).at(np.ones((6, 9, 3), np.float32), position)
+
+
+@pytest.mark.parametrize("places", [5, 7])
+def test_light_is_looked_up_in_that_of_all_places(places: int) -> None:
+    with pytest.raises(UserError, match=rf"light: got shape \(2, {places}, 9, 3\), expected \(..., 6, coefficients, 3\)"):
+        ProbeGrid.of(grid()).at(np.ones((2, places, 9, 3), np.float32), [[0.0, 3.0, 1.0]])
+
+
 def test_a_list_of_probes_is_no_grid() -> None:
     layer = grid()
     with pytest.raises(UserError, match="no grid"):
@@ -447,6 +470,42 @@ def test_bad_files(text: str, tmp_path: Path) -> None:
         probes.places(checked({"probes": {"file": str(path)}}).probes, np.array([[0.0] * 3, [1.0] * 3]))
     with pytest.raises(UserError, match=r"probes\.file"):
         probes.places(checked({"probes": {"file": str(tmp_path / "none.json")}}).probes, np.array([[0.0] * 3, [1.0] * 3]))
+
+
+@pytest.mark.parametrize("source", ["grid", "file"])
+def test_more_probes_than_the_limit_are_refused_before_they_are_placed(
+    source: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """A billion would take 24 GB; no array is made of what is past the limit, which itself is held."""
+    path = tmp_path / "probes.json"
+    path.write_text(json.dumps([[0, 0, 0]] * 9))
+    assert probes.MOST == 2**20
+    if source == "grid":
+        key, value, words = (
+            "grid",
+            [1000] * 3,
+            "probes.grid: got 1000000000 probes, expected at most 1048576; lower it",
+        )
+    else:
+        key, value, words = "file", str(path), "9 probes, expected at most 8; list fewer"
+        monkeypatch.setattr(probes, "MOST", 8)
+    with monkeypatch.context() as patch:
+        patch.setattr(probes, "np", SimpleNamespace(float64=np.float64))  # without what makes arrays
+        with pytest.raises(UserError, match=words):
+            placed({key: value})
+    smoke = Path(__file__).parent.parent / "configs" / "smoke.toml"
+    for also in ([], ["--dry-run"]):
+        assert call("bake", smoke, f"--probes.{key}", value, "--out", tmp_path / "run", *also) == 2
+        told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("ddprt: ")]
+        assert len(told) == 1
+        assert told[0].endswith(words)
+    monkeypatch.setattr(probes, "MOST", 8)
+    path.write_text(json.dumps([[0, 0, 0]] * 8))
+    assert len(placed({"file": str(path)} if source == "file" else {"grid": [2, 2, 2]})) == 8
+
+
+def placed(section: dict[str, Any]) -> np.ndarray:
+    return probes.places(checked({"probes": section}).probes, np.array([[0.0] * 3, [1.0] * 3]))
 
 
 def test_grids_stand_in_the_middle_of_their_cells() -> None:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ddprt.axes import Float, Float32, Int
+from ddprt.axes import Float, Float32, Float64, Int
 from ddprt.dataset.layers import Layer
 from ddprt.errors import UserError
 
@@ -46,9 +46,15 @@ class ProbeGrid:
         Args:
           light: of all places, as `LayerModel.predict` gives it.
           position: (n, 3) metres.
+        Raises:
+          UserError: positions that are none, or light that is not of all places.
         """
-        position = np.asarray(position, np.float64)
-        shape = tuple(map(len, self.axes))
+        position, shape = _positions(position), tuple(map(len, self.axes))
+        if light.ndim < 3 or light.shape[-3] != len(self.source) or light.shape[-1] != 3:
+            raise UserError(
+                f"light: got shape {light.shape}, expected (..., {len(self.source)}, coefficients, 3), the light of all "
+                "places; give what LayerModel.predict gives"
+            )
         low, share = [], []
         for axis, planes in enumerate(self.axes):
             at = np.interp(position[:, axis], planes, np.arange(len(planes)))
@@ -62,6 +68,19 @@ class ProbeGrid:
             place = self.source[np.ravel_multi_index(index, shape)]
             found = found + weight[:, None, None].astype(np.float32) * light[..., place, :, :]
         return np.asarray(found)
+
+
+def _positions(given: Any) -> Float64[np.ndarray, "n 3"]:
+    try:
+        position = np.asarray(given, np.float64)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"position: got no array of numbers ({error}), expected (n, 3) metres; mend it") from None
+    if position.ndim != 2 or position.shape[1] != 3:
+        raise UserError(f"position: got shape {position.shape}, expected (n, 3) metres; write [[x, y, z]] for one alone")
+    lost = np.flatnonzero(np.isnan(position).any(1))
+    if len(lost):
+        raise UserError(f"position[{lost[0]}]: got {position[lost[0]].tolist()}, expected numbers; leave out what is nowhere")
+    return position
 
 
 def nearest_valid(layer: Layer) -> Int[np.ndarray, " places"]:

@@ -5,7 +5,7 @@ is left out, an upper bound of the light it could have added. A new effect is on
 plan calls for it, and one entry of `EFFECTS`, which decides by what scene and lightings say of themselves.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from types import MappingProxyType, ModuleType
@@ -153,7 +153,13 @@ def plan(
       probes: which are asked for, in words (`config.probes.asked`); empty for none.
     Returns:
       A plan; printed, it has a line for each effect.
+    Raises:
+      UserError: no list of lightings, a lighting that cannot be read, or less than -1 bounces.
     """
+    if isinstance(lightings, str) or not isinstance(lightings, Sequence):
+        raise UserError(f"lightings: got {type(lightings).__name__}, expected a list of lightings; put one alone in brackets")
+    if bounces < -1:
+        raise UserError(f"bounces: got {bounces}, expected 0 and up, or -1; leave it out to let the scene decide")
     parsed = [parse_lighting(lighting, f"lighting {index}") for index, lighting in enumerate(lightings)]
     question = Question(scene, parsed, bounces, direct_samples, probes)
     effects = tuple(_decided(name, entry, question) for name, entry in EFFECTS.items())
@@ -170,8 +176,11 @@ def force(scene: Scene, *, on: Sequence[str] = (), off: Sequence[str] = ()) -> S
       scene: from `ddprt.load_scene` or from here.
       on, off: entries of `EFFECTS`. What is off is left out by taking out of the scene what calls for it.
     Raises:
-      UserError: unknown names, effects that cannot be forced, or both on and off.
+      UserError: no lists of names, unknown names, effects that cannot be forced, or both on and off.
     """
+    for way, names in (("on", on), ("off", off)):
+        if isinstance(names, str) or not (isinstance(names, Collection) and all(isinstance(name, str) for name in names)):
+            raise UserError(f'effects.{way}: got {names!r}, expected a list of names; write {way}=["gloss"] or the like')
     for name in (*on, *off):
         if EFFECTS[name].without is None:
             can = ", ".join(f'"{name}"' for name, entry in EFFECTS.items() if entry.without)

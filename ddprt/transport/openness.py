@@ -58,10 +58,19 @@ class _Split:
 
 
 def build_open_atlas(tracer: Tracer, scene: Scene, resolution: int, padding: int = 2) -> tuple[Atlas, dict[str, int]]:
-    """Unwraps a scene and keeps what is there and in the open; see `build_atlas`, `open_atlas` and `transport.cutouts`."""
+    """Unwraps a scene and keeps what is there and in the open; see `build_atlas`, `open_atlas` and `transport.cutouts`.
+
+    Raises:
+      UserError: all of it is holes, or buried.
+    """
     atlas = build_atlas(scene, resolution, padding)
     if tracer.openwork:
         atlas = tracer.openwork.left_of(atlas, scene)
+        if not atlas.count:
+            raise UserError(
+                f"{scene.name}: got opacity below the cutoff everywhere, so that nothing of the scene is left to light, "
+                'expected some surface between holes; mend the opacity of its materials, or set effects.off = ["cut-outs"]'
+            )
     return open_atlas(tracer, atlas, scene)
 
 

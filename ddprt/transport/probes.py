@@ -11,6 +11,7 @@ error of 1 % of the irradiance under any one distribution of light, 9 % at worst
 
 import hashlib
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -29,6 +30,7 @@ from ddprt.transport.near import NearField, columns_of
 from ddprt.transport.operator import Operator
 
 ORDER = 2
+MOST = 1 << 20  # probes
 CALL = 1 << 14  # rays of one call
 _FEW, _MANY = 64, 256  # rays of the probes that tell how noise falls, twice each
 _PILOTS, _LIGHTINGS = 64, 32  # probes and lightings that are looked at
@@ -40,12 +42,13 @@ def places(config: ProbesConfig, bounds: Float64[np.ndarray, "2 3"]) -> Float64[
     """Where probes are asked for: of a grid in the middle of each cell, x the slowest and z the fastest; metres.
 
     Raises:
-      UserError: none are asked for, or a file that does not list positions.
+      UserError: none are asked for, more than `MOST`, or a file that does not list positions.
     """
     if config.file:
         return _listed(config.file)
     if not config.asked:
         raise UserError("probes.grid: got none, expected where probes stand, since they are forced on; set a grid or a file")
+    _refuse_too_many("grid", math.prod(config.grid), "lower it")
     low, size = bounds[0], bounds[1] - bounds[0]
     axes = [
         low[axis] + size[axis] * (start + (stop - start) * (np.arange(count) + 0.5) / count)
@@ -59,11 +62,20 @@ def digest(position: Float64[np.ndarray, "places 3"]) -> str:
     return hashlib.sha256(np.ascontiguousarray(position).tobytes()).hexdigest()[:16]
 
 
+def _refuse_too_many(key: str, count: int, way: str) -> None:
+    if count > MOST:
+        raise UserError(f"probes.{key}: got {count} probes, expected at most {MOST}; {way}")
+
+
 def _listed(path: str) -> Float64[np.ndarray, "places 3"]:
     try:
-        position = np.array(json.loads(Path(path).read_text("utf-8")), np.float64)
+        listed = json.loads(Path(path).read_text("utf-8"))
+        _refuse_too_many(f"file {path}", len(listed) if isinstance(listed, list) else 0, "list fewer")
+        position = np.array(listed, np.float64)
         if position.ndim != 2 or position.shape[1] != 3 or len(position) == 0:
             raise ValueError(f"got shape {position.shape}")
+    except UserError:
+        raise
     except OSError as error:
         raise UserError(f"probes.file {path}: got {error.strerror or error}, expected a JSON list of positions") from None
     except (ValueError, TypeError, RecursionError) as error:
