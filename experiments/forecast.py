@@ -1,11 +1,12 @@
 """Forecasts against bakes.
 
 Question: does `ddprt bake --dry-run` tell the seconds, rays, files, bytes and memory of the bake that follows, within 25 %?
-Command:  python experiments/forecast.py [--quick] [--rounds N] [--side N] [--processor] [NAME ...]
+Command:  python experiments/forecast.py [--quick] [--rounds N] [--side N] [--lightings N] [--processor] [NAME ...]
 Answer:   docs/baking.md
 
 Each job is forecast and baked in fresh processes, one after the other, N times (3 unless given; 1 with --quick), with nothing
-compiled or unwrapped anew; --side N sets the atlas of all. What is told are medians over rounds of expected / actual. A stage
+compiled or unwrapped anew; --side N sets the atlas of all, --lightings N those that are trained on, a quarter as many held
+out. What is told are medians over rounds of expected / actual. A stage
 below 0.3 s in fact is put in brackets: it is told, and does not matter. Seconds of a bake are those of run.json and of what its
 record takes. With --processor all is done on one thread and seconds are the processor's, which other jobs of a busy machine
 disturb little; what waits for the disk is then not counted.
@@ -27,11 +28,14 @@ from ddprt.dataset.store import CONSTANT
 from ddprt.pipeline import Run
 from ddprt.scene.library import SCENES
 
-_AROUND = {"lightings.distribution": "around"}
+_OWN = {
+    **{name: {"lightings.distribution": "around"} for name in ("statue", "convex")},
+    "glossy-room": {"transport.target_noise": 0.05},  # else paths take hours
+}
 _SMALL = 0.3  # seconds
 _PROCESSOR = "processor"  # beside the settings of a job
 JOBS: dict[str, dict[str, Any]] = {
-    **{name: {"scene.name": name, **(_AROUND if name in ("statue", "convex") else {})} for name in SCENES},
+    **{name: {"scene.name": name, **_OWN.get(name, {})} for name in SCENES},
     **{f"cornell {side}": {"atlas.resolution": side} for side in (64, 128, 512)},
     "cornell 16 lightings": {"lightings.train": 16, "lightings.validation": 2, "lightings.test": 4},
     "all kinds": {"lightings.kinds": '["point", "spot", "directional", "rect", "sphere"]', "lightings.lights": "[1, 3]"},
@@ -75,6 +79,10 @@ def one(kind: str, changes: dict[str, str], folder: str) -> dict[str, Any]:
         if name == "probes" and path.stem != "places":
             held = path.stem.split(".")[0]
             own = "emission" if held == "constant" else f"probes {'test' if int(held) in data.split('test') else 'train'}"
+        if name.startswith("gloss-") and path.stem != "places":
+            held = path.stem.split(".")[0]
+            split = "test" if held != "constant" and int(held) in data.split("test") else "train"
+            own = "emission" if held == "constant" else f"gloss {split}, order {name.removeprefix('gloss-')}"
         own = "emission" if path.name == CONSTANT else own
         baked[own][2] += 1
         baked[own][3] += path.stat().st_size
@@ -112,12 +120,14 @@ def compare(name: str, rounds: int, changes: dict[str, Any]) -> list[float]:
     both = [(totals(told), totals(done)) for told, done in pairs]
     shares = [ratio(told[0], done[0]) for told, done in both]
     rays, files, size = (ratio(both[0][0][k], both[0][1][k]) for k in (1, 2, 3))
+    first, then = (one["stages"] for one in pairs[0])
+    traced = [ratio(first[stage][1], then[stage][1]) for stage in then]
     peak = median(ratio(told["peak"], done["peak"]) for told, done in pairs)
     spent, actual = median(told["spent"] for told, _ in pairs), median(done[0] for _, done in both)
     print(
         f"{name:<21}{actual:8.2f}{median(shares):7.2f} {min(shares):.2f}-{max(shares):.2f} "
         + " ".join(f"{cell:>7}" for cell in cells)
-        + f"{rays:8.3f}{files:7.3f}{size:7.3f}{peak:7.2f}{spent:8.2f}",
+        + f"{rays:8.3f}  {min(traced):.3f}-{max(traced):.3f}{files:7.3f}{size:7.3f}{peak:7.2f}{spent:8.2f}",
         flush=True,
     )
     return shares
@@ -130,10 +140,18 @@ def main(words: Sequence[str]) -> None:
     quick = "--quick" in words
     rounds = int(words[words.index("--rounds") + 1]) if "--rounds" in words else (1 if quick else 3)
     side = {"atlas.resolution": int(words[words.index("--side") + 1])} if "--side" in words else {}
+    count = int(words[words.index("--lightings") + 1]) if "--lightings" in words else 0
+    counts = {"train": count, "validation": max(1, count // 8), "test": max(1, count // 4)} if count else {}
+    side |= {f"lightings.{split}": number for split, number in counts.items()}
     alone = {"transport.threads": 1, _PROCESSOR: 1} if "--processor" in words else {}
     names = [word for word in words if word in JOBS] or [*(QUICK if quick else JOBS)]
-    print("expected / actual: total (range), lightings, atlas, points, direct, train, test, files; then of all:")
-    print(f"{'job':<21}{'seconds':>8}{'total':>7}" + " " * 66 + f"{'rays':>8}{'files':>7}{'bytes':>7}{'peak':>7}{'spent':>8}")
+    print("expected / actual: total (range), lightings, atlas, points, direct, train, test, other stages, files; then of all,")
+    print("rays also of the stages that are farthest off:")
+    print(
+        f"{'job':<21}{'seconds':>8}{'total':>7}"
+        + " " * 66
+        + f"{'rays':>8}{'least-most':>13}{'files':>7}{'bytes':>7}{'peak':>7}{'spent':>8}"
+    )
     shares = {name: median(compare(name, rounds, JOBS[name] | side | alone)) for name in names}
     worst = max(shares, key=lambda name: abs(shares[name] - 1))
     within = sum(0.75 <= share <= 1.25 for share in shares.values())

@@ -6,7 +6,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, get_args
@@ -514,3 +514,22 @@ def test_stages_belong_to_the_effect_that_they_are_named_after(tmp_path: Path) -
     assert before["point lights"]["rays"] == rays["direct"] > 0
     assert before["point lights"]["energy_share"] + before["diffuse bounces"]["energy_share"] == pytest.approx(1)
     assert before["spot lights"]["rays"] == before["spot lights"]["energy_share"] == 0
+
+
+@pytest.mark.parametrize("factor", [0.0, 0.25])
+def test_albedo_textures_count(factor: float) -> None:
+    """A white material under a dark texture is as dark as the texture: no bounce where that is black, a bound where not."""
+    room = ddprt.load_scene("cornell")
+    image = np.full((4, 4, 3), factor)
+    dark = replace(
+        room.made_of(lambda material: replace(material, albedo=(1.0, 1.0, 1.0), texture=image)),
+        uv=np.zeros((len(room.positions), 2)),
+    )
+    found = ddprt.plan(dark, [], bounces=1).effects[0]
+    if factor:
+        # At most a² / (1 - a) of the direct light is left out by one bounce.
+        assert found.called
+        assert found.bound == pytest.approx(factor**2 / (1 - factor))
+    else:
+        assert (found.called, found.bound) == (False, 0)
+        assert "every material is black" in found.why

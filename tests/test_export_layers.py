@@ -42,7 +42,7 @@ def data(cornell: Scene, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     folder = tmp_path_factory.mktemp("layered") / "dataset"
     shutil.copytree(ddprt.bake(cornell, config=config, out=tmp_path_factory.mktemp("plain")).folder, folder)
     description = json.loads((folder / "dataset.json").read_text())
-    description["layers"] = [{"name": "gloss-4", "quantity": "radiance", "order": ORDER}]
+    description["layers"] = [{"name": "gloss-4", "quantity": "radiance", "order": ORDER, "constant": True}]
     store.write_description(folder, description)
     plain, manifest, rng = Dataset(folder, description), Manifest(folder), np.random.default_rng(0)
     texel = rng.permutation(len(plain.area))[:PLACES]
@@ -54,6 +54,7 @@ def data(cornell: Scene, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
         write_light(folder, layer.name, index, light, manifest)
         if description["lightings"][index]["split"] == "test":
             write_light(folder, layer.name, index, 0 * light, manifest, "noise")
+    write_light(folder, layer.name, "constant", rng.uniform(0, 1, (PLACES, layer.coefficients, 3)).astype(np.float32), manifest)
     return ddprt.open_dataset(folder)
 
 

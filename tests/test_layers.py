@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -62,6 +63,16 @@ def data(plain: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
         if plain.description["lightings"][index]["split"] == "test":
             write_light(folder, "probes", index, 0 * light, manifest, "noise")
     return ddprt.open_dataset(folder)
+
+
+@pytest.mark.parametrize("wrong", [(0, 0, 0), (0, np.nan, 1), (0, 1), "up", [[1, 0, 0]] * 2], ids=str)
+def test_a_direction_that_is_none_is_refused(wrong: Any) -> None:
+    layer = Layer("gloss-2", "radiance", 2, np.zeros((5, 3)), np.ones(5), np.arange(5))
+    light = np.random.default_rng(0).standard_normal((5, 9, 3)).astype(np.float32)
+    with pytest.raises(UserError, match=r"^directions: got .*, expected \(3,\) or \(5, 3\)"):
+        layer.towards(light, np.asarray(wrong))
+    near, far = (layer.towards(light, np.array([0.0, length, 0.0])) for length in (1.0, 1e3))
+    np.testing.assert_array_equal(near, far)
 
 
 def test_a_dataset_tells_its_layers(data: Dataset, plain: Dataset) -> None:

@@ -12,7 +12,8 @@ from the code. Nothing is a constant of some machine.
 | gather | a stretch for each thread (`transport/effort.py`) | rays; columns, past 512 lightings |
 | maps in the making | 32 MiB | bytes |
 | files of indirect light | two maps for each thread | files |
-| layers | their choice of rays; some places twice, and files as they come | places, columns |
+| probes | their choice of rays; some places twice, and files as they come | places, columns |
+| gloss | choice of rays in stand-ins of the maps; some tiles of texels, all lightings in each | tiles; lightings, past 512 |
 | light of what glows | its direct part on some texels, its bounces and choice of rays | samples |
 
 An EXR is compressed in blocks of 16 rows, each by itself. So maps need not be made whole to tell their size: some blocks get
@@ -20,6 +21,7 @@ a few rays, are smoothed, and get the noise that is expected of them.
 """
 
 import json
+import re
 import tempfile
 import time
 from dataclasses import dataclass, replace
@@ -98,10 +100,11 @@ class Forecast:
 
     def __str__(self) -> str:
         rows = [*self.stages, Expected("total", self.seconds, self.rays, self.files, self.bytes)]
-        lines = [f"{'stage':<16}{'seconds':>9}{'rays':>9}{'files':>7}{'MB':>9}"]
+        wide = 2 + max(14, *(len(row.name) for row in rows))
+        lines = [f"{'stage':<{wide}}{'seconds':>9}{'rays':>9}{'files':>7}{'MB':>9}"]
         for row in rows:
             told = f"{row.seconds:9.2f}" if row.seconds < 100 else f"{row.seconds:9.0f}"
-            lines.append(f"{row.name:<16}{told}{amount(row.rays):>9}{row.files:>7}{row.bytes / 1e6:9.2f}")
+            lines.append(f"{row.name:<{wide}}{told}{amount(row.rays):>9}{row.files:>7}{row.bytes / 1e6:9.2f}")
         lines.append(f"memory at the peak about {self.peak_gib:.2g} GiB; forecast in {self.spent:.1f} s")
         if self.parts:
             part = self.parts[0]
@@ -182,7 +185,7 @@ def _foreseen(scene: Scene, config: Config, folder: Path, progress: Progress, be
     between += placing + reading * len(entries)
     stages.append(Expected("files", between, 0, named + 2, described + listing))
     lamps = [sum(map(len, (lightings[index] for index in part))) for part in (train, test)]
-    tested = sum(stage.seconds for stage in stages if stage.name.endswith(" test"))
+    tested = sum(stage.seconds for stage in stages if "test" in re.findall(r"\w+", stage.name))
     held_out = tested + reading * len(test) + direct.seconds * lamps[1] / sum(lamps)
     shorter = sorted((part for part in parts if part.then < part.seconds), key=lambda part: -part.seconds)
     return Forecast(tuple(stages), sum(stage.seconds for stage in stages) - held_out, job.peak, tuple(shorter), 0.0)

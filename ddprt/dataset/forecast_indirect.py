@@ -12,17 +12,16 @@ from ddprt.axes import Float32, Int
 from ddprt.dataset.denoise import denoised
 from ddprt.dataset.manifest import map_name
 from ddprt.dataset.probes import Sent
-from ddprt.dataset.sampled import Expected, Number, Part, Sampled, extrapolated, on_a_line, scratched
+from ddprt.dataset.sampled import WIDE, Expected, Number, Part, Sampled, extrapolated, on_a_line, scratched
 from ddprt.dataset.store import read_map, write_map
 from ddprt.lights import Lighting
 from ddprt.transport.direct import Texels
 from ddprt.transport.glossiness import valid_integrator
 
-_WIDE = 512  # lightings whose columns are really made
 _BLOCK = 16  # rows of an EXR that are compressed together
 _FEW, _LOOKED_AT = 8, 2  # rays and lightings that tell what maps look like
 _SEEN = 1 << 16  # texels that get these rays
-_SCRATCH = 1 << 25  # bytes of maps in the making that tell how long the disk takes
+SCRATCHED = 1 << 25  # bytes of maps in the making that tell how long the disk takes
 _REFERENCE = 512  # paths of the reference where nothing else is asked for
 _SHADED = 4, 16  # lightings whose difference tells what a further one costs the paths
 _NAMES = {"train": "training", "test": "held-out"}
@@ -75,7 +74,7 @@ def _by_operator(job: Sampled, split: str, indices: list[int], seen: list[int], 
     from ddprt.transport.operator import Operator
 
     config, seed, test = job.config.transport, job.config.seed, split == "test"
-    halves, count, wide = 1 + test, len(indices), min(len(indices), _WIDE)
+    halves, count, wide = 1 + test, len(indices), min(len(indices), WIDE)
     begun, before = time.perf_counter(), job.tracer.rays
     operator = Operator.of(job.tracer, job.atlas, config.sender_resolution)
     covered = job.atlas.slot >= 0
@@ -112,7 +111,7 @@ def _by_operator(job: Sampled, split: str, indices: list[int], seen: list[int], 
         gathering = on_a_line((wide // 2, fewer.seconds), (wide, gathering), count)
     again = 0.0
     if test:
-        again, more = _direct_again(job, operator, seen, count)
+        again, more = direct_again(job, seen, count, operator.averaged)
         rays += more
     given = config.test_samples if test else config.samples
     noise = float(choice.facts["noise_expected"])
@@ -122,7 +121,7 @@ def _by_operator(job: Sampled, split: str, indices: list[int], seen: list[int], 
     column = 12 * operator.senders.count * count
     maps = 12 * halves * count * job.atlas.count
     job.holds(maps, column * (2 + 4 * test), (count - wide) * column / count * 2)
-    writing = scratched(job.folder, maps, _SCRATCH, job.tracer.threads)
+    writing = scratched(job.folder, maps, SCRATCHED, job.tracer.threads)
     few = np.linspace(0, wide - 1, min(wide, _LOOKED_AT)).astype(int)
     light = bounced.radiosity.reshape(operator.senders.count, -1, 3)[:, few].reshape(operator.senders.count, -1)
     sent = Sent(operator, bounced, {"seed": seed, "stream": f"{split} 0", "near": near})
@@ -141,15 +140,17 @@ def _fewer_rays(job: Sampled, split: str, seconds: float, power: float, samples:
     return Part(what, seconds, f"transport.target_noise = {2 * config.target_noise:g}", seconds * share)
 
 
-def _direct_again(job: Sampled, operator: Any, seen: list[int], count: int) -> tuple[float, float]:
-    """Seconds and rays of the direct light that the second half of held-out maps has of its own."""
+def direct_again(
+    job: Sampled, seen: list[int], count: int, used: Callable[[np.ndarray], np.ndarray] = lambda light: light
+) -> tuple[float, float]:
+    """Seconds and rays of the direct light that the second half of held-out maps has of its own; `used`: what comes of it."""
     seed, begun = job.config.seed, time.perf_counter()
     places = seeds.stream(seed, "texel positions", 1)
     texels = Texels.of(job.tracer, job.atlas, job.config.transport.direct_samples, places)
     spreading, before = time.perf_counter() - begun, job.tracer.rays
 
     def work(index: int) -> np.ndarray:
-        return operator.averaged(texels.irradiance(job.lightings[index], seeds.stream(seed, "direct", index, 1)))
+        return used(texels.irradiance(job.lightings[index], seeds.stream(seed, "direct", index, 1)))
 
     seconds, done = job.each(work, seen, count)
     return spreading + seconds, (job.tracer.rays - before) * count / len(done)
@@ -201,7 +202,7 @@ def _by_paths(job: Sampled, split: str, indices: list[int], seen: list[int], par
     maps = 12 * halves * count * atlas.count
     job.holds(maps)
     return (
-        choosing + share * seconds + scratched(job.folder, maps, _SCRATCH, job.tracer.threads),
+        choosing + share * seconds + scratched(job.folder, maps, SCRATCHED, job.tracer.threads),
         int(rays + share * some),
         _looked(job, seen, noise),
     )

@@ -61,7 +61,7 @@ class IndirectBake:
             sent = cache(sent)  # of maps and probes
         self._maps(split, indices, sent)
         if self._probes:
-            dark = self.config.transport.bounces == 0 or not any(max(entry.albedo) for entry in self.scene.materials)
+            dark = self.config.transport.bounces == 0 or not any(entry.brightest for entry in self.scene.materials)
             self._probes.run(split, indices, sent, self.progress, dark=dark)
         for layer in self._glossy:
             layer.run(split, indices, partial(self._shown, split, indices), self.progress)

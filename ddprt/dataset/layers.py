@@ -53,9 +53,27 @@ class Layer:
     def towards(
         self, light: Float32[np.ndarray, "*frames places coefficients 3"], directions: np.ndarray
     ) -> Float32[np.ndarray, "*frames places 3"]:
-        """Values of the functions in a direction for all places, or in one for each; never below 0."""
-        Y = harmonics.harmonics(np.broadcast_to(np.asarray(directions, np.float64), self.position.shape), self.order)
+        """Values of the functions in a direction for all places, or in one for each, of any length; never below 0.
+
+        Raises:
+          UserError: directions of another shape, of length 0 or not finite.
+        """
+        Y = harmonics.harmonics(self._unit(directions), self.order)
         return np.maximum(np.einsum("...pkc,pk->...pc", light, Y.astype(np.float32)), 0)
+
+    def _unit(self, directions: np.ndarray) -> Float64[np.ndarray, "places 3"]:
+        shape = self.position.shape
+        expected = f"expected (3,) or {shape}, of some length; pass where each place is looked at from"
+        try:
+            given = np.asarray(directions, np.float64)
+        except (TypeError, ValueError):
+            raise UserError(f"directions: got no numbers, {expected}") from None
+        if given.shape not in ((3,), shape):
+            raise UserError(f"directions: got shape {given.shape}, {expected}")
+        size = np.linalg.norm(given, axis=-1, keepdims=True)
+        if not (np.isfinite(size) & (size > 0)).all():
+            raise UserError(f"directions: got one of length 0 or not finite, {expected}")
+        return np.broadcast_to(given / size, shape)
 
 
 def write_places(folder: Path, layer: Layer, manifest: Manifest) -> None:

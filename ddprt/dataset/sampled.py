@@ -12,7 +12,8 @@ import numpy as np
 from ddprt import seeds
 from ddprt.axes import Float32
 from ddprt.config import Config
-from ddprt.dataset.manifest import Manifest
+from ddprt.dataset.layers import Layer, write_light
+from ddprt.dataset.manifest import Manifest, layer_name
 from ddprt.dataset.scratch import Scratch, remove_left
 from ddprt.dataset.store import write_map
 from ddprt.files import sha256, write_text
@@ -25,6 +26,8 @@ from ddprt.transport.embree import Tracer
 
 SAMPLE = "sample-0.part"  # a file that is timed and goes
 PATIENCE = 0.7  # seconds after which no further sample of a kind is taken
+WIDE = 512  # lightings whose columns are really made
+_ROUND = 4  # calls of each thread, after one that loads and compiles
 
 Number = float | int
 Item = TypeVar("Item")
@@ -134,6 +137,35 @@ class Sampled:
             spent.append((sum(map(size, chunk)), time.perf_counter() - begun))
             step = 4 * self.tracer.threads  # the ends of rounds, where threads wait for each other, must not count for much
         return extrapolated(spent, whole), results
+
+    def rounds(self, work: Callable[[np.ndarray], None], items: np.ndarray, step: int = 1) -> tuple[float, float]:
+        """Seconds and rays of all items, from a call of each thread and some more.
+
+        Args:
+          work: what the bake does with some.
+          items: places, or tiles of them; some are drawn.
+          step: items of a call.
+        """
+        order, spent, done = seeds.stream(0, "forecast places").permutation(len(items)), list[tuple[Number, Number]](), 0
+        before = self.tracer.rays
+        for calls in (1, _ROUND):
+            some = order[done : done + calls * step * self.tracer.threads]
+            if len(some):
+                begun = time.perf_counter()
+                work(items[some])
+                spent.append((len(some), time.perf_counter() - begun))
+                done += len(some)
+        return extrapolated(spent, len(items)), (self.tracer.rays - before) * len(items) / done
+
+    def layered(self, layer: Layer, indices: Sequence[int], halves: int) -> tuple[float, int]:
+        """Seconds and bytes of a layer's files of all lightings, from some; held-out light has two files, of two halves."""
+        light = np.zeros((len(layer.position), layer.coefficients, 3), np.float32)
+        some, begun, kinds = indices[: 8 * self.tracer.threads], time.perf_counter(), ("light", "noise")[:halves]
+        for index in some:
+            for kind in kinds:
+                write_light(self.folder, layer.name, index, light, self.manifest, kind)
+        share, names = len(indices) / len(some), [layer_name(layer.name, index, kind) for index in some for kind in kinds]
+        return share * (time.perf_counter() - begun), round(share * self.size(names))
 
     def size(self, names: Sequence[str]) -> int:
         """Bytes of files that the manifest names."""

@@ -4,6 +4,7 @@ So a scene says by itself which effects it calls for: one without a `Cutout` has
 """
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -74,6 +75,12 @@ class Material:
     cutout: Cutout | None = field(default=None, repr=False)
     emission: Emission | None = field(default=None, repr=False)
     gloss: Gloss | None = field(default=None, repr=False)
+
+    @cached_property
+    def brightest(self) -> float:
+        """Largest reflectance of a channel anywhere on it."""
+        base = np.array(self.albedo)
+        return float((base if self.texture is None else base * self.texture.max((0, 1))).max())
 
     @property
     def textures(self) -> dict[str, np.ndarray]:

@@ -213,8 +213,8 @@ def _decided(name: str, entry: Entry, question: Question) -> Effect:
 
 def _diffuse_bounces(name: str, question: Question) -> Effect:
     bounces = question.bounces
-    brightest = max(question.scene.materials, key=lambda material: max(material.albedo))
-    albedo = max(brightest.albedo)
+    brightest = max(question.scene.used_materials, key=lambda material: material.brightest)
+    albedo = brightest.brightest
     if albedo == 0 and not any(glossy(question.scene)):
         return Effect(name, False, "every material is black")
     if sees_nothing(question.scene):
@@ -299,7 +299,7 @@ def _emission(name: str, question: Question) -> Effect:
     users, used = question.users(_brightest), question.scene.used_materials
     if not users:
         return Effect(name, False, "no material emits light")
-    brightest, albedo = max(map(_brightest, used)), max(max(material.albedo) for material in used)
+    brightest, albedo = max(map(_brightest, used)), max(material.brightest for material in used)
     bound = f"at most {np.pi * brightest / (1 - albedo):.3g}" if albedo < 1 else "any amount of"
     return Effect(name, True, f"{users}, {bound} W/m² of irradiance")
 

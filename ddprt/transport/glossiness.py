@@ -88,5 +88,5 @@ def lobe_left(scene: Scene, materials: Sequence[Material]) -> float | None:
         roughness, metallic = _extremes(gloss)
         f0 = 1.0 if metallic > 0 else gloss.dielectric
         shares.append(f0 + (1 - f0) * GRAZING[int(10 * roughness)])
-    share, albedo = max(shares), max(max(material.albedo) for material in scene.used_materials)
+    share, albedo = max(shares), max(material.brightest for material in scene.used_materials)
     return share / ((1 - albedo) * (1 - share)) if max(share, albedo) < 1 else None

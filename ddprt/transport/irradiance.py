@@ -57,7 +57,7 @@ def irradiance(
     tracer = Tracer.of(scene)
     # A probe may float in free air, where even a convex scene sends light to it: only black scenes end at direct light, if
     # they do not gloss.
-    black = all(max(material.albedo) == 0 for material in scene.materials) and not any(glossy(scene))
+    black = all(material.brightest == 0 for material in scene.materials) and not any(glossy(scene))
     start = on_points(tracer, place, facing)
     estimate = trace_reference(tracer, scene, parsed, start, len(place), samples, seed=seed, bounces=0 if black else -1)
     if return_variance:
