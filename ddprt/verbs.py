@@ -113,6 +113,8 @@ def bench(call: Call) -> None:
     if call.asks("quick"):
         raise UserError("--quick: got no --peers, which it belongs to; a sweep is shortened by --sweep.SECTION.KEY")
     if call.asks("effects"):
+        if swept := [key for key in call.overrides if key.partition(".")[0] == "sweep"]:
+            raise UserError(f"--{swept[0]}: got --effects, which sweeps nothing, expected one of them; run it once for each")
         job = call.run()
         print(f"{job.ablate()}\nresults:  {job.folder / 'bench' / 'effects.jsonl'}")
         return None

@@ -524,6 +524,14 @@ def test_peers_and_effects_are_two_commands(capsys: pytest.CaptureFixture) -> No
     assert "expected one of them" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("flag", [["--sweep.fit.bases", "[2, 4]"], ["--sweep", "{fit.bases = [2, 4]}"]])
+def test_effects_sweep_nothing(flag: list[str], capsys: pytest.CaptureFixture) -> None:
+    assert call("bench", HERE.parent / "configs" / "smoke.toml", "--effects", *flag) == 2
+    told = capsys.readouterr().err
+    assert f"{flag[0]}: got --effects, which sweeps nothing" in told
+    assert len(told.splitlines()) == 1
+
+
 def test_stages_belong_to_the_effect_that_they_are_named_after(tmp_path: Path) -> None:
     """Those of direct light count for every kind of light; what has no stage of its own cannot be told apart."""
     config = in_a_furnace()

@@ -38,5 +38,5 @@ def test_layers_are_compared_as_the_lightmap_is(tmp_path: Path) -> None:
     assert np.isfinite(rows["1 bounce"]["layers"]["probes"]["noise"])
     assert rows["1 bounce"]["layers"]["probes"]["noise"] < 0.05
     heading, _, *lines = text.splitlines()
-    assert heading.endswith("| probes | of it noise |")
+    assert heading.endswith("| probes | noise |")
     assert {line.count("|") for line in (heading, *lines)} == {heading.count("|")}

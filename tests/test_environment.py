@@ -522,6 +522,17 @@ def test_radiance_pictures(tmp_path: Path, packed: bool) -> None:
     np.testing.assert_array_equal(read_panorama(str(path)), np.array(expected, np.float32))
 
 
+def test_radiance_pictures_are_divided_by_all_their_exposures(tmp_path: Path) -> None:
+    path = tmp_path / "a.hdr"
+    found = []
+    for lines in ((), ("4.000000e+00",), (" 4", "0.125 ")):
+        path.write_bytes(exposed(*lines))
+        found.append(read_panorama(str(path)))
+    np.testing.assert_array_equal(found[0], np.full((4, 16, 3), 130.5 * 2.0 ** (130 - 136), np.float32))
+    np.testing.assert_array_equal(found[1], found[0] / 4)
+    np.testing.assert_array_equal(found[2], found[0] * 2)
+
+
 @pytest.mark.parametrize("channels", [1, 3, 4])
 def test_exr_pictures_of_any_channels_and_aspect(tmp_path: Path, channels: int) -> None:
     pixels = np.random.default_rng(0).random((7, 5, channels)).astype(np.float32)
@@ -558,20 +569,41 @@ def bad(value: float) -> Callable[[Path], None]:
     return write
 
 
+def depth(path: Path) -> None:
+    import OpenEXR
+
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, {"Z": np.ones((4, 8), np.float32)}).write(str(path))
+
+
+def exposed(*values: str) -> bytes:
+    """`GOOD_HDR` with such EXPOSURE lines."""
+    return GOOD_HDR.replace(b"FORMAT", "".join(f"EXPOSURE={value}\n" for value in values).encode() + b"FORMAT")
+
+
+PICTURE = ", expected an EXR or HDR picture; check the path or write it again$"
 GOOD_HDR = rgbe(np.full((4, 16, 4), 130, np.uint8), True)
 BAD: dict[str, tuple[str, Callable[[Path], object] | None, str]] = {
-    "no such file": ("sky.exr", None, r"sky\.exr: got No such file or directory, expected the image of .*; check the path"),
+    "no such file": ("sky.exr", None, rf"image \S+sky\.exr: got No such file or directory{PICTURE}"),
     "no such name": ("sun-ski", None, r'image: got "sun-ski", expected a file that ends in \.exr or .* one of "white"'),
     "another format": ("sky.png", None, r"expected a file that ends in \.exr or \.hdr"),
-    "not an EXR": ("sky.exr", lambda path: path.write_bytes(b"nothing"), "not a whole EXR image"),
+    "not an EXR": ("sky.exr", lambda path: path.write_bytes(b"nothing"), rf"image \S+: got not a whole EXR .*\){PICTURE}"),
+    "a folder": ("sky.exr", Path.mkdir, rf"image \S+sky\.exr: got no file{PICTURE}"),
+    "a folder, too": ("sky.hdr", Path.mkdir, rf"image \S+sky\.hdr: got Is a directory{PICTURE}"),
+    "depth": ("sky.exr", depth, rf"image \S+sky\.exr: got channels Z{PICTURE}"),
     "not a number": ("sky.exr", bad(np.nan), r"not finite in row 2, column 5 \(\[1\.0, nan, 1\.0\]\), expected"),
     "infinite": ("sky.exr", bad(np.inf), "not finite in row 2, column 5"),
     "negative": ("sky.exr", bad(-0.5), r"a negative radiance in row 2, column 5 .*; clip the image at 0"),
     "too bright": ("sky.exr", bad(1e31), r"a radiance above 1e\+30 in row 2"),
     "black": ("sky.exr", black, "got a black image, expected a sky that shines"),
-    "not Radiance": ("sky.hdr", lambda path: path.write_bytes(b"P6 4 4"), "got no Radiance RGBE header"),
-    "cut short": ("sky.hdr", lambda path: path.write_bytes(GOOD_HDR[:-3]), "not a whole Radiance image"),
+    "not Radiance": ("sky.hdr", lambda path: path.write_bytes(b"P6 4 4"), rf"image \S+: got no Radiance RGBE .*{PICTURE}"),
+    "cut short": ("sky.hdr", lambda path: path.write_bytes(GOOD_HDR[:-3]), rf"got not a whole Radiance image .*{PICTURE}"),
     "turned": ("sky.hdr", lambda path: path.write_bytes(GOOD_HDR.replace(b"-Y", b"+Y")), r'got "\+Y 4 \+X 16", expected rows'),
+    "no exposure": ("sky.hdr", lambda path: path.write_bytes(exposed("0")), 'got "EXPOSURE=0", expected finite numbers'),
+    "exposed below 0": ("sky.hdr", lambda path: path.write_bytes(exposed("-2", "-3")), 'got "EXPOSURE=-2", expected finite'),
+    "exposed to words": ("sky.hdr", lambda path: path.write_bytes(exposed("1", "much")), 'got "EXPOSURE=much", expected'),
+    "exposed for ever": ("sky.hdr", lambda path: path.write_bytes(exposed("inf")), 'got "EXPOSURE=inf", expected finite'),
+    "exposed too far": ("sky.hdr", lambda path: path.write_bytes(exposed(*["1e200"] * 2)), 'got "EXPOSURE=1e200", expected'),
     "too large": ("sky.hdr", lambda path: path.write_bytes(GOOD_HDR.replace(b"X 16", b"X 99999")), "got 99999 x 4 pixels"),
 }  # fmt: skip
 

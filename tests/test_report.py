@@ -2,6 +2,8 @@
 
 import io
 import re
+from collections.abc import Mapping
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -12,15 +14,17 @@ from matplotlib.image import imread
 
 import ddprt
 from ddprt.config import Config, load_config
+from ddprt.dataset.layers import Layer
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.methods.method import STATUSES
 from ddprt.report import figures
 from ddprt.report.evaluate import Evaluation, bases_curve, evaluate, spot_check
+from ddprt.report.metrics import z_scores
 from ddprt.report.page import _short, method_table, warnings, write_page
 from ddprt.report.view import Camera, default_camera, first_fronts, seen, take_view
 from ddprt.report.words import count, percent, seconds, size
-from ddprt.runtime.model import Model
+from ddprt.runtime.model import LayerModel, Model
 from ddprt.runtime.train import fit_config
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.library import SCENES
@@ -364,7 +368,7 @@ def test_warnings_speak_up_and_keep_quiet(job: Job) -> None:
     quiet = {**job.evaluation.metrics["methods"]["svd-ridge"], "status": "ok", "remarks": [], "negative_share": 0.0}
     metrics = {"methods": {"svd-ridge": quiet}, "dark_test_lightings": 0, "lightings": {"test": 5}}
     metrics["floors"] = {"noise_relative_rmse": 0.01, "projection_relative_rmse": 0.04}
-    check = {"mean": 0.1, "std": 1.05, "relative_bias": 0.002}
+    check = {"count": 96, "mean": 0.1, "std": 1.05, "relative_bias": 0.002}
     evaluation = Evaluation(metrics, job.evaluation.truth, job.evaluation.values, {}, spot_check=check)
     assert warnings(evaluation, "svd-ridge", [Effect("spot lights", False, "no lighting has one")]) == []
     metrics["floors"]["noise_relative_rmse"] = 0.02
@@ -379,6 +383,59 @@ def test_warnings_speak_up_and_keep_quiet(job: Job) -> None:
         "svd-ridge: ill_conditioned", "Noisy references", "Spot check", "Dark test lightings", "Negative light",
         "Effect cut short: diffuse bounces", "Scene repaired on loading",
     ]  # fmt: skip
+
+
+def checked_page(job: Job, lit: int) -> tuple[Mapping[str, Any], str]:
+    """A spot check of 48 values, of which so many have a variance, all off by 100 standard errors; and its page's text."""
+    truth = np.ones((1, 16, 3)) if lit else np.zeros((1, 16, 3))
+    baked, variance = truth + lit / 48, np.where(np.arange(48) < lit, (lit / 4800) ** 2, 0.0).reshape(truth.shape)
+    check = z_scores(baked, truth, variance)
+    arrays = {"texels": 16, "lightings": 1, "baked": baked, "truth": truth, "variance": variance}
+    old = job.evaluation
+    evaluation = Evaluation(old.metrics, old.truth, old.values, old.predicted, spot_check={**check, **arrays})
+    return check, " ".join(
+        "".join(outline(job.write(scene=None, models={"mean": job.models["mean"]}, evaluation=evaluation)).texts).split()
+    )
+
+
+def test_a_spot_check_without_values_tells_nothing(job: Job) -> None:
+    check, text = checked_page(job, 0)
+    assert check == {"count": 0, "mean": None, "std": None, "relative_bias": None}
+    assert "too little light, or there are too few texels, to tell" in text
+    assert "(0 values that are steady enough for a z-score)" in text
+    assert "the total light differs" not in text
+    assert "the spot check agrees" not in text
+
+
+@pytest.mark.parametrize("values", [29, 30])
+def test_a_spot_check_of_few_values_warns_of_nothing(job: Job, values: int) -> None:
+    check, text = checked_page(job, values)
+    assert check["count"] == values
+    assert check["mean"] == pytest.approx(100)
+    assert ("by more than noise" in text) == (values == 30)
+    assert ("too few texels, to tell" in text) == (values == 29)
+    assert "the z-scores have mean" in text
+
+
+@pytest.mark.parametrize("integrator", ["operator", "paths", "reference"])
+def test_advice_after_the_spot_check_suits_the_integrator(job: Job, integrator: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(job.data.description["transport"], "integrator", integrator)
+    text = checked_page(job, 48)[1]
+    assert ("by more than noise. Raise transport.sender_resolution." in text) == (integrator == "operator")
+    assert ("by more than noise. Both are unbiased, so raise report.spot_check_samples" in text) == (integrator != "operator")
+
+
+def test_sentences_about_layers_stand_apart(job: Job) -> None:
+    place = np.zeros((1, 3))
+    layer = Layer("gloss-4", "radiance", 4, place, np.ones(1), np.zeros(1, np.int64))
+    model = job.models["mean"]
+    model = replace(model, layers={name: LayerModel(layer, model) for name in ("gloss-4", "gloss-8")})
+    score = {"places": 1, "relative_rmse": 0.1, "noise_relative_rmse": 0.02}
+    metrics = {**job.evaluation.metrics, "layers": {"gloss-4": score, "gloss-8": score}}
+    evaluation = Evaluation(metrics, job.evaluation.truth, job.evaluation.values, job.evaluation.predicted)
+    page = job.write(scene=None, models={"mean": model}, evaluation=evaluation)
+    text = "".join(outline(page).texts)
+    assert len(re.findall(r"uncertain by [\d.]+\s%\.\s+Layer gloss-[48] ", text)) == 2
 
 
 def test_methods_are_sorted_by_error_and_complete(job: Job) -> None:

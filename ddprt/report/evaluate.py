@@ -266,7 +266,8 @@ def spot_check(scene: Scene, data: Dataset, config: Config) -> dict[str, Any]:
     brightness or more, as on a floor that hardly sees an object) give no z-score, but count in the bias.
 
     Returns:
-      z-scores, the relative bias, and the values of both sides, (lightings, texels, 3); empty where it is switched off.
+      z-scores, the relative bias, and the values of both sides, (lightings, texels, 3); empty where it is switched off, with
+      None for what no value tells.
     """
     from ddprt.transport.effects import plan
     from ddprt.transport.embree import Tracer

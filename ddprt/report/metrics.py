@@ -165,12 +165,15 @@ def jitter(frames: Iterable[Float32[np.ndarray, "texels 3"]], weight: Float64[np
 
 def z_scores(
     value: Float64[np.ndarray, "*n"], truth: Float64[np.ndarray, "*n"], variance: Float64[np.ndarray, "*n"]
-) -> Mapping[str, float | int]:
-    """Mean and standard deviation of (value - truth) / sqrt(variance) where the variance is positive."""
+) -> Mapping[str, float | int | None]:
+    """Mean and standard deviation of (value - truth) / sqrt(variance) where the variance is positive.
+
+    None where there is nothing to tell them from: all three without a z-score, the bias without light.
+    """
     known = variance > 0
     z = (value[known] - truth[known]) / np.sqrt(variance[known])
     if len(z) == 0:
-        return {"count": 0, "mean": 0.0, "std": 0.0, "relative_bias": 0.0}
+        return {"count": 0, "mean": None, "std": None, "relative_bias": None}
     total = float(truth.sum())
-    bias = float((value - truth).sum() / total) if total > 0 else 0.0
+    bias = float((value - truth).sum() / total) if total > 0 else None
     return {"count": len(z), "mean": float(z.mean()), "std": float(z.std()), "relative_bias": bias}

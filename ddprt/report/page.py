@@ -26,6 +26,10 @@ from ddprt.transport.embree import Tracer
 # Limits past which a number becomes a warning.
 _NOISE_SHARE = 1 / 3  # noise floor over projection floor
 _MEAN_Z, _SPREAD_Z, _BIAS = 0.3, 1.5, 0.01  # of the spot check
+_FEWEST = 30  # values of the spot check: the mean of fewer strays by more than half of _MEAN_Z by chance alone
+_UNBIASED = (
+    "Both are unbiased, so raise report.spot_check_samples and transport.test_samples; a difference that stays is a fault."
+)
 _NEGATIVE = 0.01  # negative energy over positive
 _OUTSIDE = 0.5  # share of held-out lightings outside of what was trained on
 _BOUND = 0.01  # light left out over the largest direct irradiance
@@ -111,13 +115,20 @@ def write_page(
         data=data,
         config=config,
         ratio=_ratio(evaluation, main),
-        warnings=warnings(evaluation, main, effects, data.description["scene"].get("notes", ())),
+        warnings=warnings(
+            evaluation,
+            main,
+            effects,
+            data.description["scene"].get("notes", ()),
+            data.description["transport"]["integrator"],
+        ),
         columns=[label for label, _ in _METHOD_KEYS.values()],
         methods=method_table(evaluation.metrics["methods"]),
         plots=figures.plots(evaluation, {name: model.relighter.report for name, model in models.items()}, main)
         | ({"budget": figures.budget_bars(budget)} if budget else {}),
         budget=budget,
         check=evaluation.spot_check,
+        enough=_enough(evaluation.spot_check),
         effects=effects,
         costs=effect_costs or {},
         stages=[dict(stage) for stage in stages],
@@ -129,7 +140,11 @@ def write_page(
 
 
 def warnings(
-    evaluation: Evaluation, main: str, effects: Sequence[Effect] = (), notes: Sequence[str] = ()
+    evaluation: Evaluation,
+    main: str,
+    effects: Sequence[Effect] = (),
+    notes: Sequence[str] = (),
+    integrator: str = "operator",
 ) -> list[tuple[str, str]]:
     """What a reader must know before the numbers: (title, paragraph), the gravest first."""
     metrics, check = evaluation.metrics, evaluation.spot_check
@@ -147,11 +162,14 @@ def warnings(
             f"({words.percent(projection)}): part of every error is their noise. Raise transport.test_samples."
         )
         found.append(("Noisy references", text))
-    if check and (abs(check["mean"]) > _MEAN_Z or check["std"] > _SPREAD_Z or abs(check["relative_bias"]) > _BIAS):
+    bias = check.get("relative_bias")
+    if _enough(check) and (abs(check["mean"]) > _MEAN_Z or check["std"] > _SPREAD_Z or abs(bias or 0) > _BIAS):
+        much = "not known" if bias is None else f"{_signed(100 * bias, 2)}\u00a0%"
         text = (
             f"The z-scores of baked minus traced light have mean {_signed(check['mean'], 2)} and standard deviation "
-            f"{check['std']:.2f}, and the bias is {_signed(100 * check['relative_bias'], 2)}\u00a0%; expected are 0, 1 and 0. "
-            "The bake disagrees with the unbiased integrator by more than noise. Raise transport.sender_resolution."
+            f"{check['std']:.2f}, and the bias is {much}; expected are 0, 1 and 0. "
+            "The bake disagrees with the unbiased integrator by more than noise. "
+            + ("Raise transport.sender_resolution." if integrator == "operator" else _UNBIASED)
         )
         found.append(("Spot check", text))
     if count:
@@ -175,6 +193,11 @@ def warnings(
             share = f"at most {most} of the largest direct" if most else "an unbounded share of the largest direct"
             found.append((f"Effect cut short: {effect.name}", f"{effect.why}; {share} irradiance is left out."))
     return [*found, *(("Scene repaired on loading", note) for note in notes)]
+
+
+def _enough(check: Mapping[str, Any]) -> bool:
+    """Whether the spot check has the values that its numbers say something with."""
+    return bool(check) and check["count"] >= _FEWEST
 
 
 def method_table(methods: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, list[str]]]:

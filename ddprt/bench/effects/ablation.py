@@ -156,11 +156,11 @@ def table(rows: Sequence[Row]) -> str:
     """The rows as Markdown, errors before seconds."""
     first = rows[0]
     lines = [
-        "| bake | relative RMSE | of it noise | share of light | largest change | bound | seconds | of planned | rays |",
+        "| bake | relative RMSE | noise | share of light | largest change | bound | seconds | of planned | rays |",
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for name in first.layers:
-        lines = [f"{lines[0]} {name} | of it noise |", f"{lines[1]} --- | --- |"]
+        lines = [f"{lines[0]} {name} | noise |", f"{lines[1]} --- | --- |"]
     for row in rows:
         shares = [row.relative_rmse, row.noise, row.energy_share, row.largest_change]
         told = ["-" if value is None or not row.effect else f"{value:.2%}" for value in shares]
