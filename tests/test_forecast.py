@@ -192,7 +192,7 @@ def test_every_ray_of_a_bake_is_in_its_forecast(
     """More lightings than are looked at. Shadow rays differ by 19 % between them (measured), so 64 of 80 tell their mean to
     1.1 % and 32 of 40, for the second half of held-out maps, to 1.5 %; what goes on from near senders is told from a stretch of
     texels, and was 4 % of all rays off here. Three standard errors and that: a tenth."""
-    monkeypatch.setattr("ddprt.dataset.forecast_indirect._WIDE", wide)  # past so many, columns are extrapolated
+    monkeypatch.setattr("ddprt.dataset.forecast_indirect.WIDE", wide)  # past so many, columns are extrapolated
     RayClock(monkeypatch)
     config = config_of("cornell", 24, (36, 4, 40), lightings={"clearance": 0.1}, transport={**transport, "threads": 1})
     found, stages, _ = both(config, tmp_path)
