@@ -19,7 +19,6 @@ from ddprt.dataset.store import read_map
 from ddprt.lights import Lighting
 from ddprt.scene.atlas import weights_at
 
-_LOOKED_AT = 128  # texels that the choice of rays looks at
 _CHOICE = 7  # times as much as in float32 it holds of them: two runs and their difference in float64, one as it came
 
 
@@ -158,7 +157,10 @@ def _traced(job: Sampled, lit: Any, layer: Layer, exits: Any, split: str, count:
     given = config.samples if split == "train" else config.test_samples
     choosing, rays, samples = 0.0, 0.0, RAYS_FOR_A_PATH * given if isinstance(given, int) else 0
     if given == "auto":
-        job.holds(held - (halves - 1) * count * maps, _CHOICE * 12 * min(exits.count, _LOOKED_AT) * layer.coefficients * count)
+        job.holds(
+            held - (halves - 1) * count * maps,
+            _CHOICE * 12 * min(exits.count, import_module("ddprt.transport.exitant").PROBED) * layer.coefficients * count,
+        )
         choosing, rays, samples = _chosen(job, lit, layer, exits, split)
     each = max(1, samples // halves)
     tracing, traced = _tiles(job, lit, layer, exits, split, each)

@@ -28,7 +28,7 @@ from ddprt.transport.embree import Tracer
 from ddprt.transport.glossiness import glossy
 
 RAYS_FOR_A_PATH = 8
-"""How many rays leave a glossy texel for each path that a texel of the lightmap is given: each is a tenth of the work."""
+"""How many rays leave a glossy texel for each path that a texel of the lightmap is given, which takes some 15 rays itself."""
 
 Shown = Float32[np.ndarray, "texels 3 lightings"]
 """Direct and indirect light of texels, W/m²."""

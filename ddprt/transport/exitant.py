@@ -48,7 +48,7 @@ KEPT = 0.2
 _GROUP = 32  # rays that count for each other's directions
 _CALL = 1 << 12  # rays that are traced together
 _PLACES = 16  # that are traced together: sums of all lightings take much room
-_PROBED, _PILOT = 128, 64  # texels, and rays of each in two independent runs, that predict how many are needed
+PROBED, _PILOT = 128, 64  # texels, and rays of each in two independent runs, that predict how many are needed
 _LEAST, _MOST = 8, 8192  # rays per texel that "auto" may choose
 
 
@@ -284,7 +284,7 @@ def choose_samples(lit: Lit, exits: Exits, *, target: float, seed: int, stream: 
       seed, stream: address of the random numbers; independent of those of `trace_exitant` with that stream.
     """
     odds = exits.weight / exits.weight.sum()
-    drawn = seeds.stream(seed, "exitant probes", *stream.encode()).choice(exits.count, _PROBED, p=odds)
+    drawn = seeds.stream(seed, "exitant probes", *stream.encode()).choice(exits.count, PROBED, p=odds)
     chosen, times = np.unique(drawn, return_counts=True)
     count, runs = harmonics.count(exits.order), []
     for run in range(2):
@@ -293,7 +293,7 @@ def choose_samples(lit: Lit, exits: Exits, *, target: float, seed: int, stream: 
         for _ in trace_exitant(lit, exits, out, **settings):
             pass
         runs.append(out.reshape(len(out), len(chosen), count, 3).astype(np.float64))
-    values = 3 * len(lit.lamps) * _PROBED
+    values = 3 * len(lit.lamps) * PROBED
     mean = float(((runs[0] + runs[1]) / 2)[:, :, 0].sum((0, 2)) @ times) / values
     if mean <= 0:
         return _LEAST, 0.0
