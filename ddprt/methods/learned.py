@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 from pydantic import Field
 
-from ddprt.methods.method import Examples, Method
+from ddprt.methods.method import Examples, Method, grouped
 from ddprt.training.loop import Problem, Trained, train
 from ddprt.training.schedule import Schedule
 
@@ -89,11 +89,6 @@ class Seen(NamedTuple):
         relative = self.size / jnp.max(self.size)  # of lightings that hardly any point sees, squares could pass float32's range
         share = relative**2 / jnp.sum(relative**2)
         return jnp.mean(self.importance[..., None] * share * (found.astype(jnp.float32) - self.targets) ** 2)
-
-
-def grouped(values: Float[Array, "frames _ 3"], groups: int) -> Float[Array, "frames groups _inputs"]:
-    """Channels apart (3 groups) or interleaved (1): what a transfer is applied to."""
-    return jnp.moveaxis(values, 2, 1) if groups == 3 else values.reshape(len(values), 1, -1)
 
 
 @partial(jax.jit, static_argnums=0)

@@ -236,6 +236,11 @@ def block_texels(lightings: int) -> int:
     return block_entries(3 * lightings)
 
 
+def grouped(values: Float[Array, "frames _ 3"], groups: int) -> Float[Array, "frames groups _inputs"]:
+    """Channels apart (3 groups) or interleaved (1): what a transfer is applied to."""
+    return jnp.moveaxis(values, 2, 1) if groups == 3 else values.reshape(len(values), 1, -1)
+
+
 @dataclass(frozen=True)
 class Measured:
     """What one transfer matrix learns from.

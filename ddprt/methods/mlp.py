@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 from pydantic import Field
 
 from ddprt.fitting.basis import entry_weights, fit_basis
-from ddprt.methods.learned import Learned, Network, Seen, forward, grouped, losses, statuses
-from ddprt.methods.method import Examples, FitReport, Frame, array_bytes, as_pytree, columns, found_in, static
+from ddprt.methods.learned import Learned, Network, Seen, forward, losses, statuses
+from ddprt.methods.method import Examples, FitReport, Frame, array_bytes, as_pytree, columns, found_in, grouped, static
 
 
 @as_pytree

@@ -16,8 +16,8 @@ from pydantic import Field
 
 from ddprt.fitting.basis import Basis, entry_weights, fit_basis
 from ddprt.fitting.selection import decompose, missed
-from ddprt.methods.learned import Learned, Network, Seen, forward, grouped, losses, statuses
-from ddprt.methods.method import Examples, FitReport, Frame, array_bytes, as_pytree, columns, measured
+from ddprt.methods.learned import Learned, Network, Seen, forward, losses, statuses
+from ddprt.methods.method import Examples, FitReport, Frame, array_bytes, as_pytree, columns, grouped, measured
 from ddprt.methods.svd_ridge import LinearTransfer, compose, targets, transfer_to
 
 

@@ -21,7 +21,18 @@ from ddprt.errors import UserError
 from ddprt.fitting.basis import Basis, entry_weights, fit_basis
 from ddprt.fitting.selection import Spectrum, choose_ridge, decompose
 from ddprt.fitting.transfer import point_stretch, solve_transfer
-from ddprt.methods.method import Examples, FitReport, Frame, Method, array_bytes, as_pytree, columns, found_in, measured
+from ddprt.methods.method import (
+    Examples,
+    FitReport,
+    Frame,
+    Method,
+    array_bytes,
+    as_pytree,
+    columns,
+    found_in,
+    grouped,
+    measured,
+)
 
 Ridge = Literal["auto"] | float | tuple[float, ...]
 """In units of scaled measured²; one per measurement, or "auto"."""
@@ -43,8 +54,7 @@ class LinearTransfer:
 
     def coefficients(self, frame: Frame) -> Float[Array, "frames groups bases"]:
         """u for each frame."""
-        frames, groups = len(frame.values), len(self.matrix)
-        values = jnp.moveaxis(frame.values, 2, 1) if groups == 3 else frame.values.reshape(frames, 1, -1)
+        values = grouped(frame.values, len(self.matrix))
         return jnp.einsum("gbp,fgp->fgb", self.matrix, values - self.offset, precision="highest") + self.intercept
 
     def predict(self, frame: Frame) -> Float[Array, "frames texels 3"]:
