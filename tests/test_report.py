@@ -376,11 +376,13 @@ def test_warnings_speak_up_and_keep_quiet(job: Job) -> None:
     quiet["status"] = "ill_conditioned"
     metrics["dark_test_lightings"] = 2
     quiet["negative_share"] = 0.02
+    metrics["layers"] = {"gloss-4": {}, "probes": {"unlit": 1}}
     titles = [
         title for title, _ in warnings(evaluation, "svd-ridge", [Effect("diffuse bounces", True, "forced", None, True)], ["x"])
     ]
     assert titles == [
-        "svd-ridge: ill_conditioned", "Noisy references", "Spot check", "Dark test lightings", "Negative light",
+        "svd-ridge: ill_conditioned", "Noisy references", "Spot check", "Dark test lightings", "Probes without light",
+        "Negative light",
         "Effect cut short: diffuse bounces", "Scene repaired on loading",
     ]  # fmt: skip
 

@@ -11,7 +11,7 @@ from ddprt.dataset.forecast_gloss import expect_gloss, expect_gloss_constant, li
 from ddprt.dataset.forecast_indirect import direct_again
 from ddprt.dataset.layers import write_light, write_places
 from ddprt.dataset.manifest import layer_name, map_name
-from ddprt.dataset.probes import NAME, placed_probes, scatters, shown_glow
+from ddprt.dataset.probes import NAME, name_shut, name_unlit, placed_probes, scatters, shown_glow
 from ddprt.dataset.sampled import Expected, Sampled, on_a_line
 from ddprt.dataset.store import CONSTANT, read_map, write_map
 from ddprt.transport.effects import plan, probed
@@ -19,6 +19,7 @@ from ddprt.transport.glossiness import glossy
 from ddprt.transport.sources import Sent, Shown
 
 _TEXELS = 1 << 14  # that tell what samples of direct light cost, and how many are needed
+_LOOKS, _LOOKED_AT = 64, 1 << 12  # rays that tell whether any light reaches a probe, and probes that are asked
 _PLACES = 16, 64  # probes whose difference tells what a further one costs
 _STRAIGHT = 1 << 22  # samples of all texels together that bounce in place of all
 _SAMPLES = 64  # of each texel, at least: with fewer, their noise would ask for more gather rays
@@ -56,6 +57,7 @@ def _probes(
     write_places(job.folder, layer, job.manifest)
     if split == "train":
         nothing = Expected("places", time.perf_counter() - begun, 0, 1, job.size([layer_name(NAME, "places")]))
+        name_shut(layer, job.progress)
     seconds, rays, position = 0.0, 0.0, layer.position[layer.weight > 0]
     if job.config.transport.bounces != 0 and scatters(job.scene):
         source: Sent | Shown
@@ -75,6 +77,13 @@ def _probes(
         each = source.choose_rays(position, target, halves)[0] if given == "auto" else module.power_of_two(given)
         seconds, rays = time.perf_counter() - begun + making + again[0], float(job.tracer.rays - before) + again[1]
         more, traced = job.rounds(lambda some: _gathered(source, some, each), position, max(1, step // each))
+        if split == "train":
+            some = np.flatnonzero(layer.weight > 0)
+            some = some[np.unique(np.linspace(0, len(some) - 1, min(len(some), _LOOKED_AT)).astype(int))]
+            light = np.concatenate(list(source.gather(layer.position[some], _LOOKS)), 1)
+            unlit = np.zeros(len(layer.weight), bool)
+            unlit[some[~light.any((0, 2, 3))]] = True
+            name_unlit(layer, unlit, job.progress)
         share = halves * len(indices) / columns  # of lightings past those whose columns were made
         seconds, rays = seconds + share * more, rays + halves * traced
     storing, size = job.layered(layer, indices, halves)

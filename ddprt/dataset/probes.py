@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ddprt.axes import Float32
+from ddprt.axes import Bool, Float32
 from ddprt.config import Config
 from ddprt.dataset.layers import Layer, read_layer, write_halves, write_light, write_places
 from ddprt.dataset.manifest import Manifest, layer_lacks, layer_name
@@ -153,11 +153,15 @@ class ProbeBake:
                         stage.pace(len(kinds) * rays * int(valid.sum()))
                     light[:, valid] = self._gathered(source, rays, stage)
                     del source  # before the next half's maps are read
+                if split == "train":
+                    unlit = valid & ~halves[0].any((0, 2, 3))
+                    stage.facts["unlit"] = int(unlit.sum())
+                    name_unlit(self.layer, unlit, progress)
             write_halves(
                 self.dataset.folder, NAME, todo, lambda index: [half[indices.index(index)] for half in halves], self.manifest
             )
             stage.facts["rays"] = self.tracer.rays - before
-        self._name_shut(progress)
+        name_shut(self.layer, progress)
 
     def lacks_constant(self) -> bool:
         """Whether the light of what glows is missing."""
@@ -209,13 +213,24 @@ class ProbeBake:
             stage.advance(rays * part.shape[1])
         return np.concatenate(parts, 1)
 
-    def _name_shut(self, progress: Progress) -> None:
-        """Names the probes that are not in free air."""
-        shut = np.flatnonzero(self.layer.weight == 0)
-        if len(shut):
-            told = ", ".join(f"{i} at {np.round(self.layer.position[i], 4).tolist()}" for i in shut[:_NAMED])
-            more = f" and {len(shut) - _NAMED} more" if len(shut) > _NAMED else ""
-            progress.warn(
-                f"probes: {len(shut)} of {len(self.layer.position)} stand inside solids or behind walls, and stay dark: "
-                f"{told}{more}"
-            )
+
+def name_shut(layer: Layer, progress: Progress) -> None:
+    """Names the probes that are not in free air."""
+    shut = layer.weight == 0
+    if shut.any():
+        _name(layer, shut, "stand inside solids or behind walls, and stay dark", progress)
+
+
+def name_unlit(layer: Layer, unlit: Bool[np.ndarray, " places"], progress: Progress) -> None:
+    """Names those in free air that no light of any training lighting reaches."""
+    if unlit.any():
+        way = "move the grid (probes.region_low and region_high), or see that lamps stand where probes do"
+        what = f"get no light under any training lighting, as outside of a closed room; {way}"
+        _name(layer, unlit, what, progress)
+
+
+def _name(layer: Layer, which: Bool[np.ndarray, " places"], what: str, progress: Progress) -> None:
+    found = np.flatnonzero(which)
+    told = ", ".join(f"{i} at {np.round(layer.position[i], 4).tolist()}" for i in found[:_NAMED])
+    more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
+    progress.warn(f"probes: {len(found)} of {len(which)} {what}: {told}{more}")
