@@ -54,11 +54,22 @@ class Run:
                 self.progress.say(f"scene: {note}")
         return self._scene
 
-    def bake(self) -> Dataset:
-        """Bakes (or goes on with, or finds finished) the dataset; writes the resolved configuration."""
-        from ddprt.methods.names import check_names
+    def _check(self) -> None:
+        """Refuses what a run would stumble over at its end."""
+        from ddprt.methods.names import check_names  # takes its time
 
         check_names(self.config)
+        self._check_views()
+
+    def _check_views(self) -> None:
+        if self.config.report.views:
+            from ddprt.report.eyes import check_eyes
+
+            check_eyes(self.scene, self.config.report.views, layers=self.config.effects.glossy_layers)
+
+    def bake(self) -> Dataset:
+        """Bakes (or goes on with, or finds finished) the dataset; writes the resolved configuration."""
+        self._check()
         scene = self.scene
         make_folder(self.folder)
         if self.config.lightings.target_error:
@@ -75,9 +86,7 @@ class Run:
     def forecast(self) -> Forecast:
         """What `bake` would take from nothing; samples of files are written beside the folder of the run, and removed."""
         begun = time.perf_counter()
-        from ddprt.methods.names import check_names  # takes its time, as it will when the bake begins
-
-        check_names(self.config)
+        self._check()  # takes its time, as it will when the bake begins
         scene, loading = self.scene, time.perf_counter() - begun
         beside = next(path for path in self.folder.absolute().parents if path.is_dir())
         return forecast(scene, self.config, self.progress, beside=beside, loading=loading)
@@ -99,6 +108,7 @@ class Run:
         """
         if not (self.folder / "dataset" / "dataset.json").is_file():
             raise UserError(f"{self.folder}: got no dataset, expected a run folder; run `ddprt bake` with the same --out first")
+        self._check_views()
         data = open_dataset(self.folder / "dataset")
         differs = other_settings(data.description, self.config, self.scene)
         if differs:

@@ -181,9 +181,8 @@ def warnings(
     unlit = sum(layer.get("unlit", 0) for layer in metrics.get("layers", {}).values())
     if unlit:
         text = (
-            f"{unlit} {'stands' if unlit == 1 else 'stand'} in free air and {'gets' if unlit == 1 else 'get'} no light under any "
-            "lighting: outside of a closed room, or where no lamp is. Objects there would be black. Move the grid "
-            "(probes.region_low and region_high)."
+            f"{unlit} in free air get no light under any lighting: outside of a closed room, or where no lamp is. "
+            "Objects there would be black. Move the grid (probes.region_low and region_high)."
         )
         found.append(("Probes without light", text))
     trust = metrics.get("trust") or {}
