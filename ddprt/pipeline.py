@@ -12,12 +12,12 @@ import numpy as np
 from ddprt import __version__
 from ddprt.config import Config
 from ddprt.dataset.forecast import Forecast, forecast
+from ddprt.dataset.forecast_effects import belongs
 from ddprt.dataset.generate import bake
 from ddprt.dataset.sameness import other_settings
 from ddprt.dataset.store import Dataset, open_dataset
 from ddprt.errors import UserError
 from ddprt.files import make_folder, write_text
-from ddprt.lights import LIGHTS
 from ddprt.machine import machine, peak_memory_gib
 from ddprt.progress import Progress
 from ddprt.scene.mesh import Scene
@@ -287,8 +287,7 @@ class Run:
 def _effects(effects: Plan, stages: list[dict[str, Any]], data: Dataset) -> list[dict[str, Any]]:
     """The plan with what each effect cost and what it gave.
 
-    A stage belongs to the effect whose name it begins with; those of direct light to every kind of light, those of indirect
-    light to the bounces. Shares are of all irradiance of all lightings; direct light is shared out equally among the kinds of a
+    Shares are of all irradiance of all lightings; direct light is shared out equally among the kinds of a
     lighting's lights. None stands for what cannot be told apart: what an effect does within the stages of others, which
     `ddprt bench --effects` measures.
     """
@@ -305,9 +304,7 @@ def _effects(effects: Plan, stages: list[dict[str, Any]], data: Dataset) -> list
             energy[kind] = energy.get(kind, 0.0) + float(amount) / len(lighting)
     total, rows = sum(energy.values()), []
     for effect in effects.effects:
-        lights = effect.name.removesuffix(" lights") in LIGHTS
-        begins = "indirect" if effect.name == "diffuse bounces" else "direct" if lights else effect.name
-        own = [stage for stage in stages if f"{stage['name']} ".startswith(f"{begins} ") and effect.called]
+        own = [stage for stage in stages if belongs(str(stage["name"]), effect.name) and effect.called]
         rays, seconds = sum(int(s.get("rays", 0)) for s in own), sum(float(s["seconds"]) for s in own)
         apart = bool(own) or not effect.called
         share = energy.get(effect.name, None if effect.called else 0.0)
