@@ -14,7 +14,7 @@ from ddprt.config import Config
 from ddprt.dataset.forecast import Forecast, forecast
 from ddprt.dataset.forecast_effects import belongs
 from ddprt.dataset.generate import bake
-from ddprt.dataset.sameness import other_settings
+from ddprt.dataset.sameness import check_skies, other_settings
 from ddprt.dataset.store import Dataset, open_dataset
 from ddprt.errors import UserError
 from ddprt.files import make_folder, write_text
@@ -100,11 +100,13 @@ class Run:
         baked = [stage for stage in earlier if not str(stage["name"]).startswith(_AFTER_BAKE)]
         self.progress.stages[:] = [{**stage, "earlier": "yes"} for stage in baked] or self.progress.stages
 
-    def dataset(self) -> Dataset:
+    def dataset(self, *, shines: bool = False) -> Dataset:
         """The finished dataset of this run's folder.
 
+        Args:
+          shines: whether its lightings are to shine again, for which the pictures of skies must be there.
         Raises:
-          UserError: there is none, or it is of another scene or atlas.
+          UserError: there is none, it is of another scene or atlas, or it lacks such a picture.
         """
         if not (self.folder / "dataset" / "dataset.json").is_file():
             raise UserError(f"{self.folder}: got no dataset, expected a run folder; run `ddprt bake` with the same --out first")
@@ -117,6 +119,8 @@ class Run:
                 f'{self.folder}: got a dataset of scene "{name}" baked otherwise ({differs}), expected '
                 f'"{self.scene.name}" as configured now; bake again into another --out'
             )
+        if shines:
+            check_skies(data.description, data.lightings)
         return data
 
     def fit(self, data: Dataset) -> tuple[dict[str, Any], dict[str, float]]:

@@ -349,6 +349,14 @@ def test_page_without_scene_basis_or_check(job: Job) -> None:
     assert "not recorded" in page
 
 
+def test_page_without_scene_shows_a_basis_on_the_lightmap_alone(job: Job) -> None:
+    found = outline(job.write(scene=None))
+    assert found.open == []
+    titles = "".join(found.texts)
+    assert "First basis vectors" in titles
+    assert titles.count("in the view") == 0
+
+
 def test_page_of_darkness(job: Job) -> None:
     truth = type(job.evaluation.truth)(np.zeros_like(job.evaluation.truth.reference), job.data.area)
     metrics = {**job.evaluation.metrics, "dark_test_lightings": 5}

@@ -139,10 +139,10 @@ def _grid(part: LayerModel) -> list[int] | None:
 
 def _unlit(layer: Layer, tensors: dict[str, np.ndarray]) -> list[int]:
     """Probes in free air that no light has reached."""
-    light = tensors["basis"].any(axis=(0, *range(2, tensors["basis"].ndim)))
+    light = np.abs(tensors["basis"]).sum(axis=(0, *range(2, tensors["basis"].ndim)))
     for name in {"mean", "constant"} & tensors.keys():
-        light |= tensors[name].reshape(len(light), -1).any(1)
-    return np.flatnonzero((layer.weight > 0) & ~light).tolist()
+        light = light + np.abs(tensors[name]).sum(axis=tuple(range(1, tensors[name].ndim)))
+    return np.flatnonzero((layer.weight > 0) & (light == 0)).tolist()
 
 
 def _golden_probes(part: LayerModel) -> dict[str, Any]:
