@@ -91,8 +91,8 @@ def read_hdr(path: Path) -> Float32[np.ndarray, "height width 3"]:
     channel, by all its COLORCORR lines, which tell what they were multiplied with.
 
     Raises:
-      UserError: not such a picture, not readable, cut short, in another order than rows from the top, or of no valid exposure or
-        colour correction.
+      UserError: not such a picture, not readable, cut short, in another order than rows from the top, or of no valid exposure
+        or colour correction.
     Reference: Ward, "Real Pixels", Graphics Gems II, 1991: (mantissa + 1/2) / 256 * 2^(exponent - 128), 0 where exponent is 0.
     """
     try:
