@@ -25,6 +25,7 @@ def words(found: Forecast) -> dict[str, str]:
     return {line.split(":")[0].removeprefix("effect "): line for line in str(found).splitlines() if line.startswith("effect ")}
 
 
+@pytest.mark.slow
 def test_holes_and_backs_are_counted_as_the_bake_meets_them() -> None:
     """Gather rays of a bake with holes over those of one without; the share of backs is that of half the cards."""
     scene = build("leaves")
