@@ -202,7 +202,7 @@ class Contest:
     @cached_property
     def fresh(self) -> Yardstick:
         """Held-out lightings that no search has seen: a few times as many as the fewest, the first of another seed."""
-        lightings = self.base.lightings.model_copy(update={"test": 64 if self.quick else FRESH})
+        lightings = self.base.lightings.model_copy(update={"test": FRESH})
         unlike = self.base.model_copy(update={"seed": 1, "lightings": lightings})
         return make_yardstick(self.workshop.scene, unlike, self.folder / "fresh", QUIET)
 
