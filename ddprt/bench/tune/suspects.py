@@ -3,19 +3,17 @@
 Where a few lightings in a hundred make most of a mean square, those drawn at random mostly lack them: nothing that is computed
 from 24 of these tells what is missing. But which lightings they are is known before a map is baked. What a ridge map does not
 know of a lighting x after its training lightings is the variance of a Gaussian process with the kernel x . x' (see
-`ddprt.sampling.design`); times |x|² it goes along with the squared error, and asks for shadow rays at the points alone. Lightings are
-drawn from many candidates with a density in proportion to it, a share of them whatever it says, so that no weight exceeds
-1 / share.
+`ddprt.sampling.design`); times |x|² it goes along with the squared error, and asks for shadow rays at the points alone.
+Lightings are drawn from many candidates with a density in proportion to it, a share of them whatever it says, so that no
+weight exceeds 1 / share.
 
-All that are held out, drawn evenly or so, are pooled by the balance heuristic (E. Veach and L. Guibas, Optimally combining sampling
-techniques for Monte Carlo rendering, SIGGRAPH 1995): with n_u even ones and n_s of density d (over the even one), each counts
-(n_u + n_s) / (n_u + n_s d). The mean stays that over the distribution of the configuration.
+All that are held out, drawn evenly or so, are pooled by the balance heuristic (E. Veach and L. Guibas, Optimally combining
+sampling techniques for Monte Carlo rendering, SIGGRAPH 1995): with n_u even ones and n_s of density d (over the even one),
+each counts (n_u + n_s) / (n_u + n_s d). The mean stays that over the distribution of the configuration.
 """
 
 import hashlib
-import json
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -25,15 +23,14 @@ from ddprt.axes import Float, Float64
 from ddprt.config import Config
 from ddprt.dataset.splits import choose_lightings
 from ddprt.dataset.store import Dataset
-from ddprt.files import write_text
-from ddprt.lights import Lighting, lighting_json
+from ddprt.lights import Lighting
 from ddprt.report.metrics import Tally
 from ddprt.runtime.model import Model
 from ddprt.sampling.design import RIDGE
 from ddprt.scene.mesh import Scene
 from ddprt.transport.embree import Tracer
 
-CANDIDATES = 2048
+CANDIDATES = 1024
 """Lightings that are measured, to draw from and to tell what the density integrates to."""
 _EVENLY = 0.2  # share that is drawn whatever a measurement says
 
@@ -79,23 +76,14 @@ class Suspects:
     density: Float64[np.ndarray, " candidates"]
 
     @classmethod
-    def of(cls, model: Model, data: Dataset, scene: Scene, config: Config, count: int = CANDIDATES) -> "Suspects":
-        """Draws and measures candidates.
+    def of(cls, model: Model, data: Dataset, lightings: list[Lighting]) -> "Suspects":
+        """Measures candidates.
 
         Args:
           model: fitted to `data`.
           data: whose training lightings the model knows.
-          scene: what is lit.
-          config: whose distribution candidates are drawn from, by a seed of their own.
-          count: how many.
-        Raises:
-          UserError: no free position is found for a light.
+          lightings: the candidates, see `draw_candidates`.
         """
-        drawn = {"choose": "random", "target_error": 0.0, "train": 1, "validation": 1, "test": count}
-        seed = seeds.number(config.seed, "suspects", 0)
-        tracer = Tracer.of(scene, config.transport.threads)
-        entries, _ = choose_lightings(None, config.lightings.model_copy(update=drawn), scene, tracer, seed)
-        lightings = [lighting for split, lighting in entries if split == "test"]
         trained = data.values(data.split("train"), model.points, model.quantity)
         told = unknown(np.stack([model.measure(lighting) for lighting in lightings]), trained)
         mean = float(told.mean())
@@ -116,15 +104,23 @@ class Suspects:
         chosen = np.random.default_rng(seed).choice(len(chance), count, p=chance)
         return [self.lightings[index] for index in chosen], self.density[chosen]
 
-    def write(self, lightings: list[Lighting], path: Path) -> None:
-        """A file of lightings that `lightings.file` takes: one to train on and one to validate, which nobody uses, first."""
-        write_text(path, json.dumps([lighting_json(lighting) for lighting in [*self.lightings[:2], *lightings]]) + "\n")
-
     @property
     def spread(self) -> float:
         """How far off the logarithm of a pooled error is since `mean` is that of so many candidates, not of all."""
         part = (self.density - _EVENLY) / (1 - _EVENLY)
         return float(np.sqrt(part.var() / len(part)) / 2)
+
+
+def draw_candidates(scene: Scene, config: Config, count: int = CANDIDATES) -> list[Lighting]:
+    """Lightings of the configuration's distribution, by a seed of their own.
+
+    Raises:
+      UserError: no free position is found for a light.
+    """
+    drawn = {"choose": "random", "target_error": 0.0, "train": 1, "validation": 1, "test": count}
+    tracer, seed = Tracer.of(scene, config.transport.threads), seeds.number(config.seed, "suspects")
+    entries, _ = choose_lightings(None, config.lightings.model_copy(update=drawn), scene, tracer, seed)
+    return [lighting for split, lighting in entries if split == "test"]
 
 
 def balanced(tally: Tally, density: Float64[np.ndarray, " lightings"], even: int) -> Tally:
