@@ -10,8 +10,8 @@ Command:  python experiments/frontier.py [--quick]      all of it; the last line
 Answer:   docs/frontier.md
 
 Relighting is cold: models take turns, so that no cache holds a basis. Peers of the quick part stand in `frontier_peers.py`,
-random budgets and what counts as a hit in `frontier_tune.py`; `frontier_claims.py` asks how often such a claim is right over many
-held-out draws.
+random budgets and what counts as a hit in `frontier_tune.py`; `frontier_claims.py` asks how often such a claim is right over
+many held-out draws.
 """
 
 import json

@@ -5,9 +5,9 @@ counts as a hit when the setting keeps within the limits, its error taken on hel
 refuses and no setting of the grid keeps within them, its error taken on the same. These are so many (`FRESH`) that a limit is
 not missed for the luck of the draw alone; what the answers come to on the first few of them, as many as the configuration holds
 out, is told beside it. Where `tune` says that it cannot be shown, that is no hit, but counted apart, and apart of these how
-often what it is in doubt about lies where it is said to: an error on fresh lightings, a time measured once more. A search costs what
-baking and fitting its trials took, and drawing and baking held-out lightings beyond those of the configuration; the grid what
-baking and fitting all of its places took. Places that cannot be baked are left out of the grid, and told once.
+often what it is in doubt about lies where it is said to: an error on fresh lightings, a time measured once more. A search costs
+what baking and fitting its trials took, and drawing and baking held-out lightings beyond those of the configuration; the grid
+what baking and fitting all of its places took. Places that cannot be baked are left out of the grid, and told once.
 """
 
 import json

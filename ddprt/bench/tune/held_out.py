@@ -160,9 +160,9 @@ def spread_of(tally: Tally, worse: float = 0.0) -> tuple[float, float]:
 
     Args:
       tally: of the lightings.
-      worse: times the largest squared error, of one more lighting as bright as that one, which moments are taken with where that
-        widens the spread, and the error itself is not; 0 for none. Of few lightings out of many that differ, the moments lack
-        what the error lacks.
+      worse: times the largest squared error, of one more lighting as bright as that one, which moments are taken with where
+        that widens the spread, and the error itself is not; 0 for none. Of few lightings out of many that differ, the moments
+        lack what the error lacks.
     Returns:
       Its standard error, and its skewness: that of the values that stand for the lightings, over the root of their number.
     """
