@@ -11,10 +11,13 @@ from small_job import base
 
 from ddprt.bench.measure.settings import Setting
 from ddprt.bench.measure.trial import Workshop
+from ddprt.bench.measure.yardstick import Yardstick
+from ddprt.bench.tune import held_out as module
 from ddprt.bench.tune.held_out import Fitted, HeldOut, error_of, spread_of
 from ddprt.bench.tune.planner import Plan, Planner
 from ddprt.bench.tune.search import Search
 from ddprt.bench.tune.suspects import draw_candidates, unknown
+from ddprt.config import Config
 from ddprt.lights import lighting_json, parse_lighting
 from ddprt.progress import Progress
 from ddprt.runtime.train import fit_config
@@ -69,12 +72,19 @@ def test_each_time_there_are_more_of_the_same_density(workshop: Workshop, fitted
     assert again.seconds == sum(took) < held_out.seconds, "what lay there is told as it was baked"
 
 
-def test_their_maps_are_as_fine_as_a_tenth_of_the_limit_asks(workshop: Workshop, fitted: Fitted) -> None:
+def test_their_maps_are_as_fine_as_a_tenth_of_the_limit_asks(
+    workshop: Workshop, fitted: Fitted, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[Config] = []
+
+    def note(_: Any, config: Config, *__: Any) -> Yardstick:
+        asked.append(config)
+        return workshop.yardstick
+
+    monkeypatch.setattr(module, "make_yardstick", note)
     for limit, noise in ((0.5, 0.3), (4.0, 0.4), (100.0, 1.0)):  # the configuration's is 0.3
-        held_out = HeldOut(workshop)
-        assert held_out.more(fitted, limit, 0.0)
-        settings = held_out._more[0].data.description["transport"]
-        assert settings["target_noise"] == noise
+        assert HeldOut(workshop).more(fitted, limit, 0.0)
+        assert asked[-1].bench.noise == noise
 
 
 def test_errors_are_pooled_over_all_of_them_by_what_each_counts_for(workshop: Workshop, fitted: Fitted) -> None:
