@@ -118,6 +118,8 @@ def fit_method(
         part = LayerData.of(data, layer)
         return LayerModel(layer, fit_method(part, config, name, settings, points=points, quantity=quantity, seed=seed))
 
+    of_layers = {} if isinstance(data, LayerData) else {layer.name: of_layer(layer) for layer in layers(data)}
+    relighter = _with_trouble_of(relighter, of_layers)
     return Model(
         name,
         relighter,
@@ -131,10 +133,21 @@ def fit_method(
         {key: data.description["scene"][key] for key in ("name", "digest")},
         data.uv,
         yardstick,
-        {} if isinstance(data, LayerData) else {layer.name: of_layer(layer) for layer in layers(data)},
+        of_layers,
         None if isinstance(data, LayerData) else data.holes,
         data.constant,
     )
+
+
+def _with_trouble_of(relighter: Relighter, of_layers: Mapping[str, LayerModel]) -> Relighter:
+    """What went wrong in training for a layer is told by the model, which is looked at."""
+    reports = {name: layer.model.relighter.report for name, layer in of_layers.items()}
+    troubles = {f"layer {name}": report.trouble for name, report in reports.items() if "diverged" in report.remarks}
+    if not troubles:
+        return relighter
+    own = relighter.report
+    told = "; ".join([*filter(None, [own.trouble]), *(f"{name}: {trouble}" for name, trouble in troubles.items())])
+    return replace(relighter, report=replace(own, trouble=told).noting("diverged"))  # type: ignore[type-var]
 
 
 def _judged(relighter: Relighter, encoding: Encoding, train: Examples, validation: Examples) -> tuple[Relighter, Yardstick]:
