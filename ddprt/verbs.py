@@ -112,7 +112,7 @@ def bench(call: Call) -> None:
     if call.asks("methods"):
         if given := [*call.files, *(f"--{key}" for key in (*call.overrides, *call.options) if key not in ("methods", "quiet"))]:
             raise UserError(f"ddprt bench: got --methods and {given[0]}, expected --methods alone; it lists what is installed")
-        from ddprt.bench.methods import table
+        from ddprt.methods.listing import table
 
         print(table())
         return None

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from small_job import SMALL, call
 
-from ddprt.bench.methods import table
 from ddprt.errors import UserError
 from ddprt.methods import METHODS, make_method, packages
+from ddprt.methods.listing import table
 from ddprt.methods.method import Method
 from ddprt.progress import Doubt
 

@@ -165,7 +165,7 @@ def test_a_checkpoint_of_another_training_makes_way_where_that_is_wanted(
 
 
 def test_trouble_is_not_forgotten_with_a_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A gradient beyond float32 leaves parameters that are finite, and a checkpoint: whoever goes on from it has the trouble."""
+    """A gradient beyond float32 leaves parameters that are finite, and a checkpoint: whoever goes on has the trouble too."""
     whole = loop._round
 
     def bad(*arguments: Any) -> Any:
