@@ -18,6 +18,7 @@ from ddprt.methods.learned import Learned, Seen
 from ddprt.methods.method import Examples, Frame, columns, grouped
 from ddprt.methods.residual import Residual
 from ddprt.methods.svd_ridge import SvdRidge
+from ddprt.runtime import train
 from ddprt.training import loop
 
 EPS32 = float(np.finfo(np.float32).eps)
@@ -203,3 +204,18 @@ def test_a_network_learns_from_light_that_stays_on_disk(name: str, channels: str
         norm = np.sqrt(np.einsum("lge,e->lg", light**2, entries))[..., None]
         bound = 2 * len(entries) * EPS32 * (norm / np.asarray(whole.size) + np.abs(np.asarray(whole.targets)))
         assert (np.abs(np.asarray(whole.targets) - np.asarray(cut.targets)) <= bound).all()
+
+
+def test_trouble_with_a_layer_is_told_by_the_model() -> None:
+    """Who looks at the model's report hears of its own trouble first, then of what a layer's training met."""
+    bare = METHODS["mean"]().fit(examples(1), examples(2, 12), key=KEY)
+    sound, broken = bare.report, diverged(bare, "no number").report
+    assert train._with_trouble_of(bare, {"probes": sound}) is bare
+    found = train._with_trouble_of(bare, {"probes": sound, "gloss-4": broken}).report
+    assert (found.status, found.trouble) == ("diverged", "layer gloss-4: no number")
+    both = train._with_trouble_of(diverged(bare, "none either"), {"gloss-4": broken}).report
+    assert both.trouble == "none either; layer gloss-4: no number"
+
+
+def diverged(relighter: Any, trouble: str) -> Any:
+    return replace(relighter, report=replace(relighter.report, trouble=trouble).noting("diverged"))

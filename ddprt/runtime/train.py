@@ -22,7 +22,7 @@ from ddprt.errors import UserError
 from ddprt.fitting.encoding import Encoding
 from ddprt.methods import make_method
 from ddprt.methods.floors import MeanLightmap, MeanMap
-from ddprt.methods.method import AsksForLights, Examples, Frame, Maps, Method, Relighter, block_texels, unseen_share
+from ddprt.methods.method import AsksForLights, Examples, FitReport, Frame, Maps, Method, Relighter, block_texels, unseen_share
 from ddprt.methods.statuses import BLIND
 from ddprt.runtime.model import LayerModel, Model
 from ddprt.runtime.trust import Yardstick, calibrated, make_yardstick, outside
@@ -119,7 +119,7 @@ def fit_method(
         return LayerModel(layer, fit_method(part, config, name, settings, points=points, quantity=quantity, seed=seed))
 
     of_layers = {} if isinstance(data, LayerData) else {layer.name: of_layer(layer) for layer in layers(data)}
-    relighter = _with_trouble_of(relighter, of_layers)
+    relighter = _with_trouble_of(relighter, {key: layer.model.relighter.report for key, layer in of_layers.items()})
     return Model(
         name,
         relighter,
@@ -139,10 +139,9 @@ def fit_method(
     )
 
 
-def _with_trouble_of(relighter: Relighter, of_layers: Mapping[str, LayerModel]) -> Relighter:
+def _with_trouble_of(relighter: Relighter, of_layers: Mapping[str, FitReport]) -> Relighter:
     """What went wrong in training for a layer is told by the model, which is looked at."""
-    reports = {name: layer.model.relighter.report for name, layer in of_layers.items()}
-    troubles = {f"layer {name}": report.trouble for name, report in reports.items() if "diverged" in report.remarks}
+    troubles = {f"layer {name}": report.trouble for name, report in of_layers.items() if "diverged" in report.remarks}
     if not troubles:
         return relighter
     own = relighter.report
