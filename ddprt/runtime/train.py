@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Float32
 from threadpoolctl import threadpool_limits
 
 from ddprt import seeds
+from ddprt.catalogue import Catalogue
 from ddprt.config import Config
 from ddprt.dataset.layers import Layer, LayerData, layers
 from ddprt.dataset.pack import Pack
@@ -133,7 +134,7 @@ def fit_method(
         {key: data.description["scene"][key] for key in ("name", "digest")},
         data.uv,
         yardstick,
-        of_layers,
+        Catalogue("layer", of_layers),
         None if isinstance(data, LayerData) else data.holes,
         data.constant,
     )
