@@ -124,17 +124,24 @@ class Run:
         return data
 
     def fit(self, data: Dataset) -> tuple[dict[str, Any], dict[str, float]]:
-        """Fits every method of the comparison and saves the main one; returns models and seconds by name."""
+        """Fits every method of the comparison and saves the main one; returns models and seconds by name.
+
+        What trains leaves its JSON lines in the folder `training`, and until the main model is saved, checkpoints: who was
+        interrupted goes on from there.
+        """
         from ddprt.methods.statuses import NOTES, STATUSES, worst_first
         from ddprt.runtime.train import fit_config
+        from ddprt.training.journal import keeping
 
         names = [self.config.fit.method, *(name for name in self.config.methods.compare if name != self.config.fit.method)]
         models, seconds = {}, {}
         for name in names:
             with self.progress.stage(f"fit {name}") as stage:
-                start = time.perf_counter()
-                models[name] = fit_config(data, self.config, name)
-                seconds[name] = time.perf_counter() - start
+                start, folder = time.perf_counter(), self.folder / "training" / name
+                tensorboard, every = self.config.fit.tensorboard, self.config.fit.checkpoint_seconds
+                with keeping(folder, stage, tensorboard=tensorboard, every=every, anew=self.progress.warn) as kept:
+                    models[name] = fit_config(data, self.config, name)
+                seconds[name] = time.perf_counter() - start + kept.earlier
                 stage.facts["status"] = models[name].relighter.report.status
         main = models[names[0]]
         report = main.relighter.report
@@ -148,7 +155,13 @@ class Run:
             told = ", ".join(name for name, found in remarks.items() if remark in found)
             line = f"{told}: {remark}: {STATUSES.get(remark, '')}"
             self.progress.say(f"note: {line}") if remark in NOTES else self.progress.warn(line)
+        for name, model in models.items():
+            if model.relighter.report.trouble:
+                self.progress.warn(f"{name}: {model.relighter.report.trouble}")
         main.save(self.folder / "model.ddprt")
+        for name in names:  # another fit is to take its own time
+            for path in (self.folder / "training" / name).glob("*.safetensors"):
+                path.unlink()
         write_text(self.folder / "config.toml", self.config.to_toml())
         return models, seconds
 
@@ -196,8 +209,9 @@ class Run:
     def report(self, data: Dataset, models: dict[str, Any], evaluation: Any, *, budget: dict[str, Any] | None = None) -> Path:
         """Writes report.html; `budget` is what `Run.budget` gave."""
         from ddprt.report.page import write_page
+        from ddprt.training.journal import seconds_of
 
-        path = self.folder / "report.html"
+        path, trained = self.folder / "report.html", self.folder / "training"
         with self.progress.stage("report"):
             write_page(
                 path,
@@ -211,6 +225,7 @@ class Run:
                 effect_costs={str(row["name"]): row for row in self.costs(data)},
                 command=self.command,
                 budget=budget,
+                seconds={name: seconds_of(trained / name, model.relighter.report.loss) for name, model in models.items()},
             )
         return path
 
