@@ -146,16 +146,6 @@ def test_what_would_be_worse_than_the_baseline_is_not_kept() -> None:
     np.testing.assert_allclose(found.predict(held.frame), light_of, atol=64 * EPS32 * float(jnp.max(jnp.abs(light_of))))
 
 
-def test_half_precision_trains() -> None:
-    settings = {"bases": 4, "width": 8, "steps": 50, "check_every": 50}
-    whole, half = (
-        NeuralMap(**settings, precision=kind).fit(decoded(1), decoded(2), key=KEY) for kind in ("float32", "bfloat16")
-    )
-    assert half.report.status == whole.report.status == "ok"
-    assert half.report.loss[-1][2] < 1.2 * whole.report.loss[-1][2]
-    assert half.report.loss != whole.report.loss
-
-
 def test_no_light_is_black() -> None:
     train = decoded(1)
     dark = replace(train, indirect=0 * train.indirect)

@@ -117,7 +117,8 @@ class NeuralLightmap:
 
 
 def _by_texel(maps: Float[Array, "features entries"], groups: int) -> Float[Array, "texels out features"]:
-    return jnp.moveaxis(maps.reshape(len(maps), -1, 3 // groups), 0, 2)
+    out = 3 // groups
+    return jnp.moveaxis(maps.reshape(len(maps), maps.shape[1] // out, out), 0, 2)  # there may be no map at all
 
 
 class NeuralMap(Learned):
