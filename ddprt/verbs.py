@@ -92,7 +92,7 @@ def fit(call: Call) -> None:
 def evaluate(call: Call) -> None:
     """score all methods on held-out lightings and write the report"""
     job = call.run()
-    data = job.dataset()
+    data = job.dataset(shines=True)
     models, seconds = job.fit(data)
     evaluation = job.evaluate(data, models, seconds)
     budget = job.budget(data, models) if call.asks("budget") else None

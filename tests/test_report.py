@@ -349,6 +349,14 @@ def test_page_without_scene_basis_or_check(job: Job) -> None:
     assert "not recorded" in page
 
 
+def test_page_without_scene_shows_a_basis_on_the_lightmap_alone(job: Job) -> None:
+    found = outline(job.write(scene=None))
+    assert found.open == []
+    titles = "".join(found.texts)
+    assert "First basis vectors" in titles
+    assert titles.count("in the view") == 0
+
+
 def test_page_of_darkness(job: Job) -> None:
     truth = type(job.evaluation.truth)(np.zeros_like(job.evaluation.truth.reference), job.data.area)
     metrics = {**job.evaluation.metrics, "dark_test_lightings": 5}
@@ -376,11 +384,13 @@ def test_warnings_speak_up_and_keep_quiet(job: Job) -> None:
     quiet["status"] = "ill_conditioned"
     metrics["dark_test_lightings"] = 2
     quiet["negative_share"] = 0.02
+    metrics["layers"] = {"gloss-4": {}, "probes": {"unlit": 1}}
     titles = [
         title for title, _ in warnings(evaluation, "svd-ridge", [Effect("diffuse bounces", True, "forced", None, True)], ["x"])
     ]
     assert titles == [
-        "svd-ridge: ill_conditioned", "Noisy references", "Spot check", "Dark test lightings", "Negative light",
+        "svd-ridge: ill_conditioned", "Noisy references", "Spot check", "Dark test lightings", "Probes without light",
+        "Negative light",
         "Effect cut short: diffuse bounces", "Scene repaired on loading",
     ]  # fmt: skip
 

@@ -178,6 +178,13 @@ def warnings(
             "errors but have no relative error of their own. Their lamps may stand inside a solid or outside the room."
         )
         found.append(("Dark test lightings", text))
+    unlit = sum(layer.get("unlit", 0) for layer in metrics.get("layers", {}).values())
+    if unlit:
+        text = (
+            f"{unlit} in free air get no light under any lighting: outside of a closed room, or where no lamp is. "
+            "Objects there would be black. Move the grid (probes.region_low and region_high)."
+        )
+        found.append(("Probes without light", text))
     trust = metrics.get("trust") or {}
     if (trust.get("flagged_share") or 0) > _OUTSIDE:
         found.append(("Held-out lightings of another kind", STATUSES["extrapolating"]))

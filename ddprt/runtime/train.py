@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Float32
 from threadpoolctl import threadpool_limits
 
 from ddprt import seeds
+from ddprt.catalogue import Catalogue
 from ddprt.config import Config
 from ddprt.dataset.layers import Layer, LayerData, layers
 from ddprt.dataset.pack import Pack
@@ -131,7 +132,7 @@ def fit_method(
         {key: data.description["scene"][key] for key in ("name", "digest")},
         data.uv,
         yardstick,
-        {} if isinstance(data, LayerData) else {layer.name: of_layer(layer) for layer in layers(data)},
+        Catalogue("layer", {} if isinstance(data, LayerData) else {layer.name: of_layer(layer) for layer in layers(data)}),
         None if isinstance(data, LayerData) else data.holes,
         data.constant,
     )
