@@ -15,6 +15,8 @@ from ddprt.methods.autoencoder import Autoencoder
 from ddprt.methods.floors import MeanLightmap, NearestLighting
 from ddprt.methods.method import Method
 from ddprt.methods.mlp import Mlp
+from ddprt.methods.neural_lightmap import NeuralMap
+from ddprt.methods.nonnegative import Nonnegative
 from ddprt.methods.residual import Residual
 from ddprt.methods.sh_prt import ShPrt
 from ddprt.methods.svd_ridge import SvdRidge
@@ -28,6 +30,8 @@ METHODS: Catalogue[type[Method]] = Catalogue(
         "mlp": Mlp,
         "autoencoder": Autoencoder,
         "residual": Residual,
+        "nonnegative": Nonnegative,
+        "neural-lightmap": NeuralMap,
         "sh-prt": ShPrt,
     },
 )
