@@ -34,6 +34,7 @@ from ddprt.transport.direct import Texels
 from ddprt.transport.effects import Plan, plan
 from ddprt.transport.embree import Tracer
 from ddprt.transport.glossiness import scattering
+from ddprt.transport.hairiness import refuse_beside
 from ddprt.transport.measure import measure
 from ddprt.transport.openness import build_open_atlas
 
@@ -178,6 +179,7 @@ class _Bake:
                 stage.facts |= {"train": sum(split == "train" for split, _ in entries), "shadow_rays": shadow_rays}
             lightings = [lighting for _, lighting in entries]
         effects = plan(self.scene, lightings, bounces=self.config.transport.bounces, probes=self.config.probes.asked)
+        refuse_beside(effects.called, self.config.transport.denoise)
         description = self._description(entries, effects, drawn, samples)
         if description["transport"]["integrator"] != "operator":  # which tells what it left out, if anything
             for effect in (effect for effect in effects.effects if effect.bound is None and not effect.forced):
@@ -217,6 +219,7 @@ class _Bake:
             **{key: value for key, value in baked_settings(self.config, self.scene).items() if value != []},
             "quantity": "irradiance",
             "unit": "W/m2",
+            **({"exitant": [material.name]} if (material := self.scene.strand_material) and material.fibre else {}),
             "points": self._points(samples),
             "plan": [asdict(effect) for effect in effects.effects],
             "drawn": drawn,

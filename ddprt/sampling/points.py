@@ -220,7 +220,9 @@ def _thin(position: np.ndarray, alive: np.ndarray, keep: int, area: float) -> tu
 
 def _hull(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     try:
-        hull = ConvexHull(scene.corners.reshape(-1, 3) - scene.centre)
+        # A corner of a strand belongs to six triangles or so.
+        corners = scene.corners.reshape(-1, 3) if scene.tubes is None else scene.positions
+        hull = ConvexHull(corners - scene.centre)
     except Exception as error:
         raise UserError(f'points.on: got "hull", but "{scene.name}" has a flat hull ({str(error).split(chr(10))[0]})') from None
     corners = hull.points[hull.simplices]

@@ -13,6 +13,8 @@ EXPECTED = {
     ".obj": "OBJ, lines of v x y z and f with three or more vertices",
     ".ply": "PLY, vertices with x, y and z and faces with vertex_indices",
     ".stl": "STL, as many triangles as its head says",
+    ".hair": "a .hair file, a header of 128 bytes and its arrays",
+    ".strands": "strands as text, see ddprt/scene/strands.py",
 }
 """What is read, by suffix, and what a whole file has."""
 
@@ -23,9 +25,9 @@ def load_scene(source: str | Path, **parameters: float | int) -> Scene:
     """A scene by its name in the library, or from a mesh file (metres, Y up).
 
     Args:
-      source: a key of `SCENES`, or a path that ends in .glb, .gltf, .obj, .ply or .stl; a text with a separator or a
-        suffix is a path, unless the library has it.
-      parameters: numbers that a scene of the library takes.
+      source: a key of `SCENES`, or a path that ends in .glb, .gltf, .obj, .ply or .stl, or in .hair or .strands; a text
+        with a separator or a suffix is a path, unless the library has it.
+      parameters: numbers that a scene of the library takes; of strands the `scale`, metres of a unit of the file.
     Raises:
       UserError: no such scene, parameter, file or format, or a file that is damaged or fails a check.
     """
@@ -47,6 +49,10 @@ def load_scene(source: str | Path, **parameters: float | int) -> Scene:
         raise UserError(f"{name[:60]}...: got {why}, expected a path; check it") from None
     if not there:
         raise UserError(f"{path}: got no such file, expected a mesh; check the path")
+    if suffix in (".hair", ".strands") and set(parameters) <= {"scale"}:
+        from ddprt.scene.tubes import load_hair
+
+        return load_hair(path, float(parameters.get("scale", 1.0)))
     if parameters:
         raise UserError(f"{path.name}: got parameter {next(iter(parameters))}, expected none for a file; leave it out")
     try:

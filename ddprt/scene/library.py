@@ -10,6 +10,7 @@ from ddprt.catalogue import Catalogue
 from ddprt.errors import UserError, nearest
 from ddprt.scene.checks import checked, vertex_normals
 from ddprt.scene.cornell import cornell, cornell_hole
+from ddprt.scene.furball import furball
 from ddprt.scene.lion import lion
 from ddprt.scene.material import Cutout, Emission, Gloss, Material
 from ddprt.scene.mesh import Scene
@@ -298,6 +299,7 @@ SCENES: Catalogue[Callable[..., Scene]] = Catalogue(
         "leaves": leaves,
         "neon": neon,
         "lion": lion,
+        "furball": furball,
     },
 )
 

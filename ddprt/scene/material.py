@@ -57,6 +57,27 @@ class Gloss:
 
 
 @dataclass(frozen=True)
+class Fibre:
+    """What a strand of hair does with light: the model of Chiang et al., 2016; see `ddprt.transport.fibre`.
+
+    The material's albedo is the colour of much hair seen from afar, where a strand has none of its own.
+
+    Attributes:
+      along: roughness along the fibre, 0 to 1, 0 excluded.
+      around: roughness about it, likewise.
+      tilt_deg: of the scales on its surface, towards the root.
+      index: of refraction, above 1.
+      absorption: optical depth of a radius per channel; None takes what gives the strand its colour.
+    """
+
+    along: float = 0.3
+    around: float = 0.3
+    tilt_deg: float = 2.0
+    index: float = 1.55
+    absorption: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True)
 class Material:
     """A surface. Textures of one material share its texture coordinates.
 
@@ -65,7 +86,7 @@ class Material:
       albedo: linear Rec.709 reflectance, each 0 to 1.
       texture: (height, width, 3) linear factor on the albedo, row 0 at the top, or None.
       two_sided: the back reflects as the front does; `checked` makes surfaces of their own of such backs.
-      cutout, emission, gloss: what there is besides.
+      cutout, emission, gloss, fibre: what there is besides; only strands may be of a material with a fibre.
     """
 
     name: str
@@ -75,6 +96,7 @@ class Material:
     cutout: Cutout | None = field(default=None, repr=False)
     emission: Emission | None = field(default=None, repr=False)
     gloss: Gloss | None = field(default=None, repr=False)
+    fibre: Fibre | None = field(default=None, repr=False)
 
     @cached_property
     def brightest(self) -> float:

@@ -10,8 +10,36 @@ from functools import cached_property
 
 import numpy as np
 
-from ddprt.axes import Float, Float64, Int, Int32
+from ddprt.axes import Float, Float32, Float64, Int, Int32
 from ddprt.scene.material import Material, bilinear
+
+SIDES = 3
+"""Of the prisms that strands are made of."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tubes:
+    """Strands of a scene, whose last triangles they are: strand by strand, piece by piece, two for each side.
+
+    Attributes:
+      axis: points at equal arc lengths, metres, world space.
+      radius: of the fibre there, metres.
+      colour: of each strand; see `ddprt.scene.strands.Strands`.
+    """
+
+    axis: Float64[np.ndarray, "strands rings 3"]
+    radius: Float64[np.ndarray, "strands rings"]
+    colour: Float32[np.ndarray, "strands 3"]
+
+    @property
+    def pieces(self) -> int:
+        """Of a strand."""
+        return self.axis.shape[1] - 1
+
+    @property
+    def triangles(self) -> int:
+        """Of all strands."""
+        return len(self.axis) * self.pieces * 2 * SIDES
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +58,7 @@ class Scene:
       whole: the scene that this one is, when a user has left effects out of it; see `ddprt.transport.effects.force`.
       forced: effects that a user wants simulated whatever the materials say.
       refused: effects that a user wants left out likewise.
+      tubes: strands, of which the last triangles are; None where there are none.
     """
 
     name: str
@@ -43,6 +72,7 @@ class Scene:
     whole: "Scene | None" = None
     forced: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
+    tubes: Tubes | None = None
 
     @cached_property
     def corners(self) -> Float64[np.ndarray, "triangles 3 3"]:
@@ -89,19 +119,26 @@ class Scene:
                 state.update(str(array.shape).encode() + np.ascontiguousarray(array).tobytes())
         state.update(repr([material.albedo for material in self.materials]).encode())
         for index, material in enumerate(self.materials):
-            for part in (material.cutout, material.emission, material.gloss):
+            for part in (material.cutout, material.emission, material.gloss, material.fibre):
                 if part is not None:
                     state.update(f"{index} {part}".encode())
             for name, image in material.textures.items():
                 if name != "albedo":
                     state.update(f"{index} {name} {image.shape}".encode() + np.ascontiguousarray(image).tobytes())
         state.update(repr(self.forced).encode() if self.forced else b"")
+        if self.tubes is not None:
+            state.update(f"{self.tubes.axis.shape}".encode() + self.tubes.radius.tobytes() + self.tubes.colour.tobytes())
         return state.hexdigest()[:16]
 
     @cached_property
     def used_materials(self) -> tuple[Material, ...]:
         """Those that some triangle has."""
         return tuple(self.materials[index] for index in np.unique(self.material))
+
+    @property
+    def strand_material(self) -> Material | None:
+        """What its strands are made of; None where there are none."""
+        return None if self.tubes is None else self.materials[self.material[-1]]
 
     def made_of(self, change: Callable[[Material], Material]) -> "Scene":
         """The same shape of other materials."""

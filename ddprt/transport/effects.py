@@ -24,6 +24,7 @@ from ddprt.scene.mesh import Scene
 from ddprt.scene.sheets import backs, without_backs
 from ddprt.sections import TransportConfig
 from ddprt.transport.glossiness import glossy, lobe_left, worth_gloss
+from ddprt.transport.hairiness import diffuse, hairy
 
 _FLAT = 1e-6  # of the radius: how far a corner may stand before a triangle's plane and still be in it
 _CHUNK = 1 << 22
@@ -224,13 +225,14 @@ def _diffuse_bounces(name: str, question: Question) -> Effect:
     bounces = question.bounces
     brightest = max(question.scene.used_materials, key=lambda material: material.brightest)
     albedo = brightest.brightest
-    if albedo == 0 and not any(glossy(question.scene)):
+    hair = hairy(question.scene)
+    if albedo == 0 and not any(glossy(question.scene)) and not hair:
         return Effect(name, False, "every material is black")
-    if sees_nothing(question.scene):
+    if question.scene.tubes is None and sees_nothing(question.scene):
         return Effect(name, False, "no surface faces another: the scene is convex seen from outside")
     if bounces >= 0:
         glows = any(_brightest(material) for material in question.scene.used_materials)  # with lamps however dim
-        left = albedo ** (bounces + 1) / (1 - albedo) if albedo < 1 and not glows else None
+        left = albedo ** (bounces + 1) / (1 - albedo) if albedo < 1 and not (glows or hair) else None
         return Effect(name, bounces > 0, f"forced to {bounces} (largest albedo {albedo:.3g})", left, True)
     why = f'largest albedo {albedo:.3g} ("{brightest.name}"), and surfaces face each other'
     if albedo >= 1:
@@ -323,6 +325,13 @@ def _without_emission(scene: Scene) -> Scene:
     return scene.made_of(lambda material: replace(material, emission=None))
 
 
+def _hair(name: str, question: Question) -> Effect:
+    tubes = question.scene.tubes
+    if tubes is None or not hairy(question.scene):
+        return Effect(name, False, "the scene has no strands" if tubes is None else "its strands are diffuse")
+    return Effect(name, True, f"{len(tubes.axis)} strands of {question.users(lambda entry: entry.fibre)}")
+
+
 def _probes(name: str, question: Question) -> Effect:
     asked = question.probes
     return Effect(name, bool(asked), f"the configuration asks for {asked}" if asked else "the configuration asks for none")
@@ -342,6 +351,12 @@ EFFECTS: Catalogue[Entry] = Catalogue(
         "cut-outs": Entry(_material(pierced, "no material has holes"), "cutouts", _without_cutouts),
         "two-sided sheets": Entry(_two_sided, without=without_backs),
         "emission": Entry(_emission, "emission", _without_emission),
+        "hair": Entry(
+            _hair,
+            "hair",
+            lambda scene: scene.made_of(diffuse),
+            cost=lambda question: "as many paths as the noise that is asked for takes, which go from strand to strand",
+        ),
         "probes": Entry(_probes, "probes", lambda scene: scene, lambda question: 0.0),  # no lightmap has light from them
     },
 )

@@ -85,6 +85,11 @@ class GlossyVertices:
         """The receivers."""
         return self.there.owner
 
+    @property
+    def facing(self) -> Float32[np.ndarray, "n 3"]:
+        """The normals."""
+        return self.there.facing
+
     def blocks(self) -> "Iterator[GlossyVertices]":
         """Parts of about equal size that fit into a core's cache."""
         first = 0

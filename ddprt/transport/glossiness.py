@@ -13,6 +13,7 @@ from ddprt.errors import UserError
 from ddprt.scene.material import Gloss, Material
 from ddprt.scene.mesh import Scene
 from ddprt.transport.embree import Tracer
+from ddprt.transport.hairiness import hairy, refuse_hairy
 
 
 def worth_gloss(material: Material) -> bool:
@@ -50,8 +51,8 @@ def valid_integrator(asked: str, scene: Scene) -> str:
     """The cheapest integrator that is valid for a scene's materials, where "auto" is asked for; else the one asked for.
 
     Raises:
-      UserError: the operator, which takes surfaces as diffuse, for a scene with gloss. Leaving gloss out is the user's to say,
-        so that the plan tells of it.
+      UserError: the operator, which takes surfaces as diffuse, for a scene with gloss or hair, or the reference for hair. Leaving
+        these out is the user's to say, so that the plan tells of it.
     """
     users = [f'"{entry.name}"' for entry, chosen in zip(scene.materials, glossy(scene), strict=True) if chosen]
     if users and asked == "operator":
@@ -59,7 +60,9 @@ def valid_integrator(asked: str, scene: Scene) -> str:
             f'transport.integrator: got "operator", which takes all surfaces as diffuse, but material {", ".join(users[:3])} '
             'glosses; expected "auto", "paths" or "reference", or effects.off = ["gloss"]'
         )
-    return ("paths" if users else "operator") if asked == "auto" else asked
+    if asked in ("operator", "reference"):
+        refuse_hairy(scene, f'transport.integrator = "{asked}"', 'set transport.integrator = "auto"')
+    return ("paths" if users or hairy(scene) else "operator") if asked == "auto" else asked
 
 
 GRAZING = (1.0, 0.85, 0.62, 0.43, 0.29, 0.2, 0.14, 0.1, 0.075, 0.06, 0.05)

@@ -23,6 +23,7 @@ from ddprt.scene.mesh import Scene
 from ddprt.scene.raster import interpolate, rasterise
 from ddprt.transport.embree import Tracer
 from ddprt.transport.gather import BACK, Landing, Pattern, Receivers, seen_from
+from ddprt.transport.hairiness import hairy
 from ddprt.transport.squares import CUT, Cut, as_images, find_corners, find_places, grown
 
 _FIRST, _SECOND = 8, 32  # rays that look for backs in every texel, and from each place of a doubtful one
@@ -63,6 +64,8 @@ def build_open_atlas(tracer: Tracer, scene: Scene, resolution: int, padding: int
     Raises:
       UserError: all of it is holes, or buried.
     """
+    if scene.tubes is not None:
+        return _with_strands(scene, resolution, padding, tracer.threads)
     atlas = build_atlas(scene, resolution, padding)
     if tracer.openwork:
         atlas = tracer.openwork.left_of(atlas, scene)
@@ -72,6 +75,16 @@ def build_open_atlas(tracer: Tracer, scene: Scene, resolution: int, padding: int
                 'expected some surface between holes; mend the opacity of its materials, or set effects.off = ["cut-outs"]'
             )
     return open_atlas(tracer, atlas, scene)
+
+
+def _with_strands(scene: Scene, resolution: int, padding: int, threads: int) -> tuple[Atlas, dict[str, int]]:
+    """The same of a scene with strands, which bury nothing: what they grow from is looked at as if they were not there."""
+    from ddprt.scene.strand_texels import square_beside, with_strand_texels
+    from ddprt.scene.tubes import bald
+
+    side, rest = square_beside(scene, resolution), bald(scene)
+    atlas, hidden = (None, {}) if rest is None else build_open_atlas(Tracer.of(rest, threads), rest, side, padding)
+    return with_strand_texels(atlas, scene, resolution, simulated=hairy(scene)), hidden
 
 
 def open_atlas(tracer: Tracer, atlas: Atlas, scene: Scene) -> tuple[Atlas, dict[str, int]]:

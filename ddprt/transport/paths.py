@@ -26,6 +26,7 @@ from ddprt.transport.direct import centred
 from ddprt.transport.embree import Tracer
 from ddprt.transport.gather import Receivers
 from ddprt.transport.glossiness import glossy_surfaces
+from ddprt.transport.hairiness import strands_of
 from ddprt.transport.shading import shade, shift
 from ddprt.transport.walk import Meetings, albedo_of, starts, walked
 
@@ -87,7 +88,8 @@ def follow(
 ) -> Iterator[int]:
     """The same with light of any kind: `shading` tells what vertices are worth."""
     receivers = Receivers.texels(atlas, samples, seed, f"{stream} paths", texels)
-    albedo, gloss = albedo_of(scene), glossy_surfaces(tracer, scene)
+    albedo, hair = albedo_of(scene), strands_of(tracer, scene)
+    gloss = hair or glossy_surfaces(tracer, scene)
 
     def work(item: tuple[int, slice]) -> int:
         index, tile = item
@@ -95,8 +97,9 @@ def follow(
             address = *stream.encode(), samples, int(receivers.patch[tile.start])
             walk, chance = (seeds.stream(seed, name, *address) for name in ("path walk", "path lights"))
             sums = np.zeros((len(out), tile.stop - tile.start, 3))
-            for start in starts(tracer, receivers, tile):
-                for met in walked(tracer, albedo, start, walk, bounces, gloss):
+            for start, triangle in starts(tracer, receivers, tile):
+                begun = hair.begun(*start[:2], triangle, walk) if hair else None
+                for met in walked(tracer, albedo, start, walk, bounces, gloss, begun):
                     for part in met.blocks():
                         shading(part, chance, sums)
             with np.errstate(over="ignore"):  # what is not finite is refused where light is stored

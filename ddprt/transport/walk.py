@@ -26,7 +26,7 @@ Albedo = Callable[[Int32[np.ndarray, " n"], np.ndarray, np.ndarray], Float32[np.
 """Albedo at hits, from triangle (-1 gives anything) and weights of the second and third corner."""
 
 Gloss = Any
-"""What `ddprt.transport.gloss.Surfaces` is; not imported where nothing glosses."""
+"""What `ddprt.transport.gloss.Surfaces` or `ddprt.transport.hair.Hair` is; not imported where there is none."""
 
 Rays = tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"], Int32[np.ndarray, " n"]]
 """Origins, directions, and the receiver that each belongs to."""
@@ -50,6 +50,11 @@ class Vertices:
     def brightness(self) -> Float32[np.ndarray, " n"]:
         """Largest throughput of the channels."""
         return self.throughput.max(0)
+
+    @property
+    def facing(self) -> Float32[np.ndarray, "n 3"]:
+        """The normals."""
+        return self.place[3:].T
 
     def lit_from(self, directions: Float32[np.ndarray, "n 3"]) -> "Vertices":
         """What each W/m² that arrives from directions is worth to the receivers: the same from all."""
@@ -84,8 +89,13 @@ class Meetings(Protocol):
         """As in `Vertices`."""
         ...
 
+    @property
+    def facing(self) -> Float32[np.ndarray, "n 3"] | None:
+        """Normals of the half-spaces that light comes from; None where it comes from all sides."""
+        ...
+
     def lit_from(self, directions: Float32[np.ndarray, "n 3"]) -> Vertices:
-        """What each W/m² that arrives from directions is worth to the receivers."""
+        """What each W/m² that arrives from directions is worth to the receivers, and where its shadow rays start."""
         ...
 
     def blocks(self) -> "Iterator[Meetings]":
@@ -101,8 +111,10 @@ def albedo_of(scene: Scene) -> Albedo:
     return lambda triangle, u, v: np.take(table, triangle, axis=0, mode="wrap")
 
 
-def starts(tracer: Tracer, receivers: Receivers, tile: slice) -> Iterator[Rays]:
-    """First rays of a tile's paths, some samples at a time; owners count from the tile's start."""
+def starts(
+    tracer: Tracer, receivers: Receivers, tile: slice
+) -> Iterator[tuple[Rays, Int32[np.ndarray, " n"]]]:
+    """First rays of a tile's paths, some samples at a time, and where they start; owners count from the tile's start."""
     pattern, block, turn = receivers.pattern, receivers.block[tile], receivers.turn[tile]
     cosine, sine = turn.T
     step = max(1, BLOCK // len(block))
@@ -115,15 +127,24 @@ def starts(tracer: Tracer, receivers: Receivers, tile: slice) -> Iterator[Rays]:
         z = np.sqrt(np.maximum(1 - x * x - y * y, 0))
         local = np.stack([cosine * x - sine * y, sine * x + cosine * y, z], 2).reshape(-1, 3)
         frames = tracer.frames[triangle]
-        yield lifted(tracer, positions, frames[:, 2]), warp.to_world(local, frames), owner
+        yield (lifted(tracer, positions, frames[:, 2]), warp.to_world(local, frames), owner), triangle
 
 
 def walked(
-    tracer: Tracer, albedo: Albedo, rays: Rays, rng: np.random.Generator, bounces: int, gloss: Gloss | None = None
+    tracer: Tracer,
+    albedo: Albedo,
+    rays: Rays,
+    rng: np.random.Generator,
+    bounces: int,
+    gloss: Gloss | None = None,
+    throughput: Float32[np.ndarray, "3 n"] | None = None,
 ) -> "list[Meetings]":
-    """Follows paths to their ends, and lists what they met: diffuse surfaces, and glossy ones where there are any."""
+    """Follows paths to their ends, and lists what they met: diffuse surfaces, and glossy ones or strands where there are any.
+
+    They begin with a throughput of 1, or with that given, which is overwritten.
+    """
     origins, directions, owner = rays
-    throughput = np.ones((3, len(owner)), np.float32)
+    throughput = np.ones((3, len(owner)), np.float32) if throughput is None else throughput
     parts, shiny, met = list[Vertices](), list[Any](), None
     while True:
         triangle, u, v, _ = tracer.first(origins, directions)

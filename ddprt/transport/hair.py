@@ -1,0 +1,286 @@
+"""Hair on the way of light: where paths begin on strands or meet one, and what they carry on from there.
+
+A strand is traced as a prism (`ddprt.scene.tubes`) and scatters as the round fibre that it stands for (`ddprt.transport.fibre`).
+Where a ray meets the prism tells how far off the axis it passes: its place within the prism's outline as seen by the ray, which is
+as evenly spread as that of rays on a round fibre. What leaves the fibre starts on its axis, moved out of the prism across it.
+
+A texel of a strand keeps pi times the radiance that leaves it, averaged about the fibre and over directions as a surface
+that they leave does, by the cosine with the plane across it: W/m², as the radiosity of its side area. Rays that leave a face of
+the prism by its cosine are spread so, and hence `starts` serves: each is seen as if someone looked at the fibre along it.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ddprt.axes import Float32, Float64, Int32
+from ddprt.compiled import compiled
+from ddprt.scene.mesh import SIDES, Scene
+from ddprt.scene.tubes import CORNER, ring_corners
+from ddprt.transport import fibre
+from ddprt.transport.embree import Tracer
+from ddprt.transport.walk import MAX_SURVIVAL, SURVIVAL, Vertices
+
+_NOT_ACROSS = 1e-6  # sine of the angle between ray and fibre below which any direction across will do
+
+
+@dataclass(frozen=True, eq=False)
+class FibreVertices:
+    """Where paths met strands, ready for any light.
+
+    Attributes:
+      there: points on the axis (the normal is the direction across it towards the viewer) and receivers; the throughput is what
+        a receiver gains for each W/(m² sr) that leaves towards the path's last vertex, over pi.
+      frames: rows along the fibre, across it towards the viewer, and across both.
+      reach: of the prism from its axis, metres.
+      held: see `fibre.prepared`.
+      shape: see `fibre.shape_of`.
+    """
+
+    there: Vertices
+    frames: Float32[np.ndarray, "n 3 3"]
+    reach: Float32[np.ndarray, " n"]
+    held: Float32[np.ndarray, "n 23"]
+    shape: Float64[np.ndarray, "6"]
+
+    @classmethod
+    def joined(cls, parts: "Sequence[FibreVertices]") -> "FibreVertices":
+        """One list of many."""
+        frames, reach = np.concatenate([part.frames for part in parts]), np.concatenate([part.reach for part in parts])
+        held = np.concatenate([part.held for part in parts])
+        return cls(Vertices.joined([part.there for part in parts]), frames, reach, held, parts[0].shape)
+
+    @property
+    def place(self) -> Float32[np.ndarray, "6 n"]:
+        """Points on the axis and directions across it."""
+        return self.there.place
+
+    @property
+    def owner(self) -> Int32[np.ndarray, " n"]:
+        """The receivers."""
+        return self.there.owner
+
+    @property
+    def facing(self) -> None:
+        """Light from all sides counts."""
+
+    def blocks(self) -> "Iterator[FibreVertices]":
+        """Parts of about equal size that fit into a core's cache."""
+        first = 0
+        for there in self.there.blocks():
+            part = slice(first, first + len(there.owner))
+            yield FibreVertices(there, self.frames[part], self.reach[part], self.held[part], self.shape)
+            first = part.stop
+
+    def lit_from(self, directions: Float32[np.ndarray, "n 3"]) -> Vertices:
+        """What each W/m² that arrives from directions, on a plane that faces it, is worth to the receivers.
+
+        Shadow rays start outside of the prism; their normals are the directions themselves, which weigh nothing.
+        """
+        place, throughput = np.empty_like(self.there.place), np.empty_like(self.there.throughput)
+        local = np.empty((len(self.reach), 3), np.float32)
+        _leave(self.there.place, self.frames, self.reach, directions, local, place)
+        np.multiply(self.there.throughput, np.float32(np.pi) * fibre.phase(self.held, self.shape, local).T, out=throughput)
+        return replace(self.there, place=place, throughput=throughput)
+
+    def scattered(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Origins and directions that light may come from, and phase over density."""
+        local, weight = fibre.sample(self.held, self.shape, rng.random((len(self.owner), 4), np.float32))
+        directions = np.einsum("ni,nij->nj", local, self.frames).astype(np.float32)
+        place, again = np.empty_like(self.there.place), np.empty_like(local)
+        _leave(self.there.place, self.frames, self.reach, directions, again, place)
+        return np.ascontiguousarray(place[:3].T), directions, weight
+
+    def go_on(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Origins and directions of the paths that survive roulette, their throughput and receivers."""
+        origins, directions, weight = self.scattered(rng)
+        throughput = self.there.throughput * weight.T
+        survival = np.minimum(np.float32(SURVIVAL) * throughput.max(0), np.float32(MAX_SURVIVAL))
+        kept = np.flatnonzero(rng.random(len(survival), np.float32) < survival)
+        return origins[kept], directions[kept], throughput[:, kept] / survival[kept], self.owner[kept]
+
+
+@dataclass(frozen=True, eq=False)
+class Hair:
+    """The strands of a scene.
+
+    Attributes:
+      tracer: the geometry.
+      first: triangle that they begin with; all after it are theirs.
+      pieces: of a strand.
+      rings: axis and corners of the prisms, centred frame, metres.
+      reach: of each ring from its axis, metres, with what keeps rays off it.
+      absorption: optical depth of a radius, for each strand and channel.
+      material: how they scatter.
+    """
+
+    tracer: Tracer
+    first: int
+    pieces: int
+    rings: Float32[np.ndarray, "rings points 3"]
+    reach: Float32[np.ndarray, " rings"]
+    absorption: Float64[np.ndarray, "strands 3"]
+    material: fibre.Fibre
+
+    @classmethod
+    def of(cls, tracer: Tracer, scene: Scene) -> "Hair":
+        """Those of a scene that has some, of a material with a fibre."""
+        tubes, made_of = scene.tubes, scene.strand_material
+        assert tubes is not None
+        assert made_of is not None
+        material = made_of.fibre
+        assert material is not None
+        corners = ring_corners(tubes)
+        rings = np.concatenate([tubes.axis[:, :, None], corners], 2) - tracer.centre
+        colour = fibre.absorption_of(tubes.colour, material.around)
+        absorption = colour if material.absorption is None else np.tile(np.array(material.absorption, np.float64), (len(colour), 1))
+        reach = (CORNER * tubes.radius).ravel().astype(np.float32) + tracer.offset
+        first = len(scene.triangles) - tubes.triangles
+        rows = np.ascontiguousarray(rings.reshape(-1, 1 + SIDES, 3), np.float32)
+        return cls(tracer, first, tubes.pieces, rows, reach, absorption, material)
+
+    def seen(
+        self,
+        triangle: Int32[np.ndarray, " n"],
+        place: Float32[np.ndarray, "n 3"],
+        directions: Float32[np.ndarray, "n 3"],
+        throughput: Float32[np.ndarray, "3 n"],
+        owner: Int32[np.ndarray, " n"],
+    ) -> FibreVertices:
+        """Strands that someone sees.
+
+        Args:
+          triangle, place: of the prisms, and where on them.
+          directions: unit, towards the viewer.
+          throughput, owner: see `FibreVertices`.
+        """
+        count = len(triangle)
+        frames, reach = np.empty((count, 3, 3), np.float32), np.empty(count, np.float32)
+        rows, strand = np.empty((6, count), np.float32), np.empty(count, np.int32)
+        sine, offset = np.empty((2, count), np.float32)
+        where = triangle, place, directions, self.first, self.pieces, self.rings, self.reach
+        _look(*where, frames, reach, rows, strand, sine, offset)
+        held = fibre.prepared(sine, offset, self.absorption[strand], self.material)
+        return FibreVertices(Vertices(rows, throughput, owner), frames, reach, held, fibre.shape_of(self.material))
+
+    def met(
+        self,
+        triangle: Int32[np.ndarray, " n"],
+        u: Float32[np.ndarray, " n"],
+        v: Float32[np.ndarray, " n"],
+        directions: Float32[np.ndarray, "n 3"],
+        throughput: Float32[np.ndarray, "3 n"],
+        owner: Int32[np.ndarray, " n"],
+    ) -> tuple[Int32[np.ndarray, " n"], FibreVertices | None]:
+        """Triangles that rays hit, -1 now where they are a strand's, and the paths that met one, from whatever side."""
+        hit = np.flatnonzero(triangle >= self.first)
+        if not len(hit):
+            return triangle, None
+        others = triangle.copy()
+        others[hit] = -1
+        place = self.tracer.on_triangle(triangle[hit], u[hit], v[hit])
+        return others, self.seen(triangle[hit], place, -directions[hit], throughput[:, hit], owner[hit])
+
+    def begun(
+        self,
+        origins: Float32[np.ndarray, "n 3"],
+        directions: Float32[np.ndarray, "n 3"],
+        triangle: Int32[np.ndarray, " n"],
+        rng: np.random.Generator,
+    ) -> Float32[np.ndarray, "3 n"]:
+        """Throughput of paths at their first rays, of which those that leave a strand are overwritten in place.
+
+        They leave in the direction that someone sees the strand from, and go on where the light that he sees may come from.
+        """
+        throughput = np.ones((3, len(triangle)), np.float32)
+        mine = np.flatnonzero(triangle >= self.first)
+        if len(mine):
+            there = self.seen(triangle[mine], origins[mine], directions[mine], throughput[:, mine], mine.astype(np.int32))
+            origins[mine], directions[mine], weight = there.scattered(rng)
+            throughput[:, mine] = weight.T
+        return throughput
+
+
+@compiled
+def _look(
+    triangle: np.ndarray,
+    place: np.ndarray,
+    towards: np.ndarray,
+    first: int,
+    pieces: int,
+    rings: np.ndarray,
+    reach: np.ndarray,
+    frames: np.ndarray,
+    far: np.ndarray,
+    rows: np.ndarray,
+    strand: np.ndarray,
+    sine: np.ndarray,
+    offset: np.ndarray,
+) -> None:
+    """The fibre's frame, its axis next to a place, and how far off it the line of sight passes."""
+    axis, across, beside, corner = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for i in range(len(triangle)):
+        piece = (triangle[i] - first) // (2 * SIDES)
+        strand[i] = piece // pieces
+        low = piece + strand[i]  # a strand has a ring more than pieces
+        length, along = 0.0, 0.0
+        for k in range(3):
+            axis[k] = rings[low + 1, 0, k] - rings[low, 0, k]
+            length += axis[k] * axis[k]
+            along += axis[k] * (place[i, k] - rings[low, 0, k])
+        share, length = min(max(along / length, 0.0), 1.0), np.sqrt(length)
+        s = 0.0
+        for k in range(3):
+            axis[k] /= length
+            s += axis[k] * towards[i, k]
+        size = 0.0
+        for k in range(3):
+            across[k] = towards[i, k] - s * axis[k]
+            size += across[k] * across[k]
+        if size < _NOT_ACROSS * _NOT_ACROSS:  # then any will do: the first corner's
+            size, s_corner = 0.0, 0.0
+            for k in range(3):
+                across[k] = rings[low, 1, k] - rings[low, 0, k]
+                s_corner += across[k] * axis[k]
+            for k in range(3):
+                across[k] -= s_corner * axis[k]
+                size += across[k] * across[k]
+        size = np.sqrt(size)
+        for k in range(3):
+            across[k] /= size
+        for k in range(3):
+            beside[k] = axis[(k + 1) % 3] * across[(k + 2) % 3] - axis[(k + 2) % 3] * across[(k + 1) % 3]
+        least, most, own = np.inf, -np.inf, 0.0
+        for side in range(SIDES):
+            off = 0.0
+            for k in range(3):
+                corner[k] = (1 - share) * rings[low, 1 + side, k] + share * rings[low + 1, 1 + side, k]
+                off += beside[k] * (corner[k] - (1 - share) * rings[low, 0, k] - share * rings[low + 1, 0, k])
+            least, most = min(least, off), max(most, off)
+        for k in range(3):
+            centre = (1 - share) * rings[low, 0, k] + share * rings[low + 1, 0, k]
+            own += beside[k] * (place[i, k] - centre)
+            rows[k, i], rows[3 + k, i] = centre, across[k]
+            frames[i, 0, k], frames[i, 1, k], frames[i, 2, k] = axis[k], across[k], beside[k]
+        offset[i] = min(max(2 * (own - least) / (most - least) - 1, -1.0), 1.0)
+        far[i], sine[i] = max(reach[low], reach[low + 1]), s
+
+
+@compiled
+def _leave(
+    there: np.ndarray, frames: np.ndarray, reach: np.ndarray, directions: np.ndarray, local: np.ndarray, place: np.ndarray
+) -> None:
+    """Directions in the fibre's frame, and rays' origins: out of the prism, across it, where they go."""
+    for i in range(len(reach)):
+        x, y, z = np.float32(0), np.float32(0), np.float32(0)
+        for k in range(3):
+            x += frames[i, 0, k] * directions[i, k]
+            y += frames[i, 1, k] * directions[i, k]
+            z += frames[i, 2, k] * directions[i, k]
+        local[i, 0], local[i, 1], local[i, 2] = x, y, z
+        size = np.sqrt(y * y + z * z)
+        y, z = (y / size, z / size) if size > 0 else (np.float32(1), np.float32(0))
+        for k in range(3):
+            place[k, i] = there[k, i] + reach[i] * (y * frames[i, 1, k] + z * frames[i, 2, k])
+            place[3 + k, i] = directions[i, k]
