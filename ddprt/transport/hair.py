@@ -5,8 +5,9 @@ Where a ray meets the prism tells how far off the axis it passes: its place with
 as evenly spread as that of rays on a round fibre. What leaves the fibre starts on its axis, moved out of the prism across it.
 
 A texel of a strand keeps pi times the radiance that leaves it, averaged about the fibre and over directions as a surface
-that they leave does, by the cosine with the plane across it: W/m², as the radiosity of its side area. Rays that leave a face of
-the prism by its cosine are spread so, and hence `starts` serves: each is seen as if someone looked at the fibre along it.
+that they leave does, by the cosine with the plane across it: W/m², as the radiosity of its side area. By exchanging both integrals
+that is the light that falls on the fibre, weighed by what it makes of light from there (`fibre.gains`). Rays that leave the
+prism's faces by their cosine are spread as its outline is wide, and so the first rays of all paths are those of any surface.
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,6 +17,7 @@ import numpy as np
 
 from ddprt.axes import Float32, Float64, Int32
 from ddprt.compiled import compiled
+from ddprt.scene.material import Fibre
 from ddprt.scene.mesh import SIDES, Scene
 from ddprt.scene.tubes import CORNER, ring_corners
 from ddprt.transport import fibre
@@ -113,6 +115,7 @@ class Hair:
       reach: of each ring from its axis, metres, with what keeps rays off it.
       absorption: optical depth of a radius, for each strand and channel.
       material: how they scatter.
+      gains: see `fibre.gains`.
     """
 
     tracer: Tracer
@@ -121,7 +124,8 @@ class Hair:
     rings: Float32[np.ndarray, "rings points 3"]
     reach: Float32[np.ndarray, " rings"]
     absorption: Float64[np.ndarray, "strands 3"]
-    material: fibre.Fibre
+    material: Fibre
+    gains: Float64[np.ndarray, "clarities angles"]
 
     @classmethod
     def of(cls, tracer: Tracer, scene: Scene) -> "Hair":
@@ -138,7 +142,7 @@ class Hair:
         reach = (CORNER * tubes.radius).ravel().astype(np.float32) + tracer.offset
         first = len(scene.triangles) - tubes.triangles
         rows = np.ascontiguousarray(rings.reshape(-1, 1 + SIDES, 3), np.float32)
-        return cls(tracer, first, tubes.pieces, rows, reach, absorption, material)
+        return cls(tracer, first, tubes.pieces, rows, reach, absorption, material, fibre.gains(material))
 
     def seen(
         self,
@@ -155,14 +159,27 @@ class Hair:
           directions: unit, towards the viewer.
           throughput, owner: see `FibreVertices`.
         """
+        look = self._look(triangle, place, directions)
+        held = fibre.prepared(look.sine, look.offset, self.absorption[look.strand], self.material)
+        there = Vertices(look.rows, throughput, owner)
+        return FibreVertices(there, look.frames, look.reach, held, fibre.shape_of(self.material))
+
+    def _look(
+        self,
+        triangle: Int32[np.ndarray, " n"],
+        place: Float32[np.ndarray, "n 3"],
+        directions: Float32[np.ndarray, "n 3"],
+    ) -> "_Look":
         count = len(triangle)
-        frames, reach = np.empty((count, 3, 3), np.float32), np.empty(count, np.float32)
-        rows, strand = np.empty((6, count), np.float32), np.empty(count, np.int32)
-        sine, offset = np.empty((2, count), np.float32)
+        found = _Look(
+            np.empty((count, 3, 3), np.float32),
+            np.empty((6, count), np.float32),
+            np.empty(count, np.int32),
+            *np.empty((4, count), np.float32),
+        )
         where = triangle, place, directions, self.first, self.pieces, self.rings, self.reach
-        _look(*where, frames, reach, rows, strand, sine, offset)
-        held = fibre.prepared(sine, offset, self.absorption[strand], self.material)
-        return FibreVertices(Vertices(rows, throughput, owner), frames, reach, held, fibre.shape_of(self.material))
+        _look(*where, found.frames, found.rows, found.strand, found.reach, found.sine, found.offset, found.width)
+        return found
 
     def met(
         self,
@@ -187,19 +204,39 @@ class Hair:
         origins: Float32[np.ndarray, "n 3"],
         directions: Float32[np.ndarray, "n 3"],
         triangle: Int32[np.ndarray, " n"],
-        rng: np.random.Generator,
     ) -> Float32[np.ndarray, "3 n"]:
-        """Throughput of paths at their first rays, of which those that leave a strand are overwritten in place.
+        """Throughput of paths at their first rays; where they leave strands, what these make of light.
 
-        They leave in the direction that someone sees the strand from, and go on where the light that he sees may come from.
+        The prism's outline is wider from some sides than from others; the round fibre's is not.
         """
         throughput = np.ones((3, len(triangle)), np.float32)
         mine = np.flatnonzero(triangle >= self.first)
         if len(mine):
-            there = self.seen(triangle[mine], origins[mine], directions[mine], throughput[:, mine], mine.astype(np.int32))
-            origins[mine], directions[mine], weight = there.scattered(rng)
-            throughput[:, mine] = weight.T
+            towards = np.ascontiguousarray(directions[mine])
+            look = self._look(triangle[mine], origins[mine], towards)
+            gain = fibre.gain(self.gains, look.sine, self.absorption[look.strand])
+            throughput[:, mine] = (gain * look.width[:, None]).T
         return throughput
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """Lines of sight that meet strands: see `FibreVertices` for frames and reach, `Vertices` for rows.
+
+    Attributes:
+      strand: which.
+      sine: of the angle with the plane across the fibre.
+      offset: how far off the axis they meet it, as a share of the outline's half width.
+      width: of the round fibre over that of the prism, seen along them.
+    """
+
+    frames: Float32[np.ndarray, "n 3 3"]
+    rows: Float32[np.ndarray, "6 n"]
+    strand: Int32[np.ndarray, " n"]
+    reach: Float32[np.ndarray, " n"]
+    sine: Float32[np.ndarray, " n"]
+    offset: Float32[np.ndarray, " n"]
+    width: Float32[np.ndarray, " n"]
 
 
 @compiled
@@ -212,11 +249,12 @@ def _look(
     rings: np.ndarray,
     reach: np.ndarray,
     frames: np.ndarray,
-    far: np.ndarray,
     rows: np.ndarray,
     strand: np.ndarray,
+    far: np.ndarray,
     sine: np.ndarray,
     offset: np.ndarray,
+    width: np.ndarray,
 ) -> None:
     """The fibre's frame, its axis next to a place, and how far off it the line of sight passes."""
     axis, across, beside, corner = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
@@ -251,7 +289,7 @@ def _look(
             across[k] /= size
         for k in range(3):
             beside[k] = axis[(k + 1) % 3] * across[(k + 2) % 3] - axis[(k + 2) % 3] * across[(k + 1) % 3]
-        least, most, own = np.inf, -np.inf, 0.0
+        least, most, own, round_ = np.inf, -np.inf, 0.0, 0.0
         for side in range(SIDES):
             off = 0.0
             for k in range(3):
@@ -264,6 +302,11 @@ def _look(
             rows[k, i], rows[3 + k, i] = centre, across[k]
             frames[i, 0, k], frames[i, 1, k], frames[i, 2, k] = axis[k], across[k], beside[k]
         offset[i] = min(max(2 * (own - least) / (most - least) - 1, -1.0), 1.0)
+        for k in range(3):
+            centre = (1 - share) * rings[low, 0, k] + share * rings[low + 1, 0, k]
+            edge = (1 - share) * rings[low, 1, k] + share * rings[low + 1, 1, k] - centre
+            round_ += edge * edge
+        width[i] = 2 * np.sqrt(round_) / (CORNER * (most - least))
         far[i], sine[i] = max(reach[low], reach[low + 1]), s
 
 

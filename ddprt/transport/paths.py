@@ -98,7 +98,7 @@ def follow(
             walk, chance = (seeds.stream(seed, name, *address) for name in ("path walk", "path lights"))
             sums = np.zeros((len(out), tile.stop - tile.start, 3))
             for start, triangle in starts(tracer, receivers, tile):
-                begun = hair.begun(*start[:2], triangle, walk) if hair else None
+                begun = hair.begun(*start[:2], triangle) if hair else None
                 for met in walked(tracer, albedo, start, walk, bounces, gloss, begun):
                     for part in met.blocks():
                         shading(part, chance, sums)
