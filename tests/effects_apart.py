@@ -27,8 +27,8 @@ JOB: dict[str, Any] = {
     "points": {"count": 4, "supersample": 1},
     "transport": {"samples": 8, "test_samples": 8, "threads": 2},
 }
-AROUND = ("statue", "convex", "lion")
-SMALL = {"statue": {"subdivisions": 2}, "furnace": {"subdivisions": 2}, "lion": {"cells": 36}}
+AROUND = ("statue", "convex", "lion", "furball")
+SMALL = {"statue": {"subdivisions": 2}, "furnace": {"subdivisions": 2}, "lion": {"cells": 36}, "furball": {"strands": 40}}
 RESOLUTIONS = {"lion": 128}  # of a body in many charts
 ROOM = "ddprt.transport."
 

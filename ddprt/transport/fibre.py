@@ -98,14 +98,13 @@ def gains(fibre: Fibre) -> Float64[np.ndarray, "clarities angles"]:
     shape = shape_of(fibre)
     clarity, angle = np.linspace(0, 1, _CLARITIES), np.linspace(-np.pi / 2, np.pi / 2, _ANGLES)
     seen = (np.arange(_SEEN) + 0.5) / _SEEN * np.pi - np.pi / 2
-    offset = (np.arange(_ACROSS) + 0.5) / _ACROSS * 2 - 1
-    absorption = np.repeat(-np.log(np.maximum(clarity, 1e-12))[:, None], 3, 1)
+    offset = np.tile((np.arange(_ACROSS) + 0.5) / _ACROSS * 2 - 1, _CLARITIES)
+    depth = np.repeat(-np.log(np.maximum(clarity, 1e-12)), _ACROSS)
+    absorption = np.stack([depth, depth, depth], 1)
     found = np.zeros((_CLARITIES, _ANGLES))
     for direction in seen:
-        passed = np.empty((_CLARITIES, 4))
-        for row, depth in enumerate(absorption):
-            held = prepared(np.full(_ACROSS, np.sin(direction)), offset, np.tile(depth, (_ACROSS, 1)), fibre)
-            passed[row] = held[:, _PASS::3].mean(0, dtype=np.float64)
+        held = prepared(np.full(len(offset), np.sin(direction)), offset, absorption, fibre)
+        passed = held[:, _PASS::3].reshape(_CLARITIES, _ACROSS, 4).mean(1, dtype=np.float64)
         _add_gain(passed, held[0].astype(np.float64), shape, angle, np.cos(direction) ** 2 * np.pi / _SEEN, found)
     return found
 

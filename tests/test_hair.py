@@ -1,0 +1,192 @@
+"""Hair in transport: energy, laws of linear light, plans, refusals, and bakes."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ddprt
+from ddprt.config import Config, checked
+from ddprt.errors import UserError
+from ddprt.lights import parse_lighting
+from ddprt.scene.exr import write_exr
+from ddprt.scene.library import build
+from ddprt.scene.material import Emission, Gloss, Material
+from ddprt.scene.mesh import Scene
+from ddprt.scene.tubes import TEXELS, bald, with_strands
+from ddprt.transport import fibre
+from ddprt.transport.effects import force, plan
+from ddprt.transport.embree import Tracer
+from ddprt.transport.gather import Receivers
+from ddprt.transport.hair import Hair
+from ddprt.transport.openness import build_open_atlas
+from ddprt.transport.paths import trace_paths
+from ddprt.transport.walk import starts
+
+SUN: dict[str, Any] = {"type": "directional", "direction": [0.3, -1, 0.2], "irradiance": [1, 1, 1]}
+LAMP: dict[str, Any] = {"type": "point", "position": [0.2, 0.1, 0.1], "intensity": [0.1, 0.1, 0.1]}
+
+
+@pytest.fixture(scope="module")
+def fur() -> Scene:
+    return build("furball", strands=60, subdivisions=1)
+
+
+def white(scene: Scene) -> Scene:
+    """Nothing absorbs."""
+    assert scene.tubes is not None
+    bright = replace(scene, tubes=replace(scene.tubes, colour=np.ones_like(scene.tubes.colour)))
+    return bright.made_of(lambda material: replace(material, albedo=(1.0, 1.0, 1.0)))
+
+
+def traced(scene: Scene, lightings: list[Any], samples: int, resolution: int = 48, threads: int = 2, **given: Any) -> Any:
+    tracer = Tracer.of(scene, threads)
+    atlas, _ = build_open_atlas(tracer, scene, resolution)
+    out = np.zeros((len(lightings), atlas.count, 3), np.float32)
+    lamps = [parse_lighting(lighting) for lighting in lightings]
+    for _ in trace_paths(tracer, scene, atlas, lamps, out, samples=samples, **{"seed": 0, "stream": "test", **given}):
+        pass
+    return out, atlas, tracer
+
+
+def test_white_fur_under_a_white_sky_is_as_bright_as_the_sky(fur: Scene, tmp_path: Path) -> None:
+    """Radiance 1 from everywhere: what leaves a texel is pi. Of that, light straight from the sky is no part of its map."""
+    scene = white(fur)
+    write_exr(tmp_path / "white.exr", np.ones((4, 8, 3), np.float32))
+    samples = 512
+    out, atlas, tracer = traced(scene, [{"type": "environment", "image": str(tmp_path / "white.exr")}], samples)
+    hair = Hair.of(tracer, scene)
+    receivers = Receivers.texels(atlas, samples, 0, "test paths")  # the very first rays of the bake
+    straight = np.zeros(atlas.count)
+    for tile in receivers.tiles():
+        for (origins, directions, owner), triangle in starts(tracer, receivers, tile):
+            weight = hair.begun(origins, directions, triangle)[0]
+            escaped = tracer.first(origins, directions)[0] < 0
+            np.add.at(straight, tile.start + owner[escaped], weight[escaped] / samples)
+    total = out[0, :, 0] / np.pi + straight
+    fibres = np.arange(atlas.count) >= atlas.count - 60 * TEXELS
+    for chosen in (fibres, ~fibres):
+        values = total[chosen]
+        deviation = values.std() / np.sqrt(len(values))
+        print(f"{values.mean():.4f} +- {deviation:.4f}, straight {straight[chosen].mean():.3f}")
+        # The issue asks for 0.5 %. Texels share random numbers in blocks, which widens the mean's spread by less than twice.
+        assert values.mean() == pytest.approx(1, abs=0.005 + 4 * deviation)
+        assert deviation < 0.005
+        assert 0.2 < straight[chosen].mean() < 0.97
+
+
+def test_light_adds_and_knows_no_threads(fur: Scene) -> None:
+    out, _, _ = traced(fur, [[SUN], [LAMP], [SUN, LAMP], [{**SUN, "irradiance": [2, 2, 2]}]], 16)
+    again, _, _ = traced(fur, [[SUN]], 16, threads=1)
+    np.testing.assert_array_equal(out[0], again[0])
+    np.testing.assert_allclose(out[3], 2 * out[0], rtol=1e-5)  # the same rays, twice as bright
+    np.testing.assert_allclose(out[2], out[0] + out[1], rtol=1e-5)
+    assert (out >= 0).all()
+    assert out[0].max() > 0
+
+
+def test_a_lone_fibre_gets_nothing_and_two_do() -> None:
+    """Straight ones; light that a fibre scatters itself is direct."""
+    from ddprt.scene.strands import Strands
+
+    def lit(count: int) -> np.ndarray:
+        points = np.array([[[0, 0, x], [0, 1, x]] for x in np.linspace(0, 0.03, count)], np.float64)
+        strands = Strands(
+            points.reshape(-1, 3), np.full(2 * count, 0.01), 2 * np.arange(count + 1), np.ones((count, 3), np.float32)
+        )
+        scene = with_strands(None, "row", strands, Material("hair", (1.0, 1.0, 1.0), fibre=fibre.Fibre()))
+        return traced(scene, [{**SUN, "direction": [1, 0, 0]}], 64, 24)[0]
+
+    assert not lit(1).any()
+    assert lit(2).mean() > 0.01
+
+
+def test_forward_light_is_coloured_by_what_it_passes(fur: Scene) -> None:
+    """Ginger: fur lit by white light sends out more red than blue, as gains say of light that goes through it once."""
+    out, atlas, _ = traced(fur, [SUN], 128)
+    red, green, blue = out[0, -60 * TEXELS :].mean(0)
+    assert red > 1.1 * green > 1.2 * blue
+    white_fur, _, _ = traced(white(fur), [SUN], 128)
+    assert white_fur[0, -60 * TEXELS :].mean() > red
+    assert atlas.count > 60 * TEXELS
+
+
+def test_forced_bounces_are_a_beginning(fur: Scene) -> None:
+    one, two, all_of_them = (traced(white(fur), [SUN], 64, bounces=bounces)[0].mean() for bounces in (1, 2, -1))
+    assert 0 < one < two < all_of_them
+
+
+def test_the_plan_names_strands_and_off_makes_them_diffuse(fur: Scene, cornell: Scene) -> None:
+    entry = {effect.name: effect for effect in plan(fur, ()).effects}["hair"]
+    assert entry.called
+    assert entry.why == '60 strands of material "fur"'
+    assert plan(fur, ()).module("hair") is not None
+    assert not plan(cornell, ()).called("hair")
+    off = force(fur, off=["hair"])
+    assert not plan(off, ()).called("hair")
+    left_out = {effect.name: effect for effect in plan(off, ()).effects}["hair"]
+    assert left_out.bound is None
+    assert left_out.forced
+    tracer = Tracer.of(off, 1)
+    atlas, _ = build_open_atlas(tracer, off, 48)
+    np.testing.assert_allclose(atlas.albedo[-60 * TEXELS :], [[0.72, 0.42, 0.16]] * 60 * TEXELS)
+
+
+def job(**changes: Any) -> Config:
+    base: dict[str, Any] = {
+        "atlas": {"resolution": 48},
+        "points": {"count": 8, "on": "hull", "supersample": 1},
+        "lightings": {"train": 3, "validation": 1, "test": 1, "distribution": "around"},
+        "transport": {"samples": 8, "test_samples": 16, "threads": 2},
+    }
+    return checked({**base, **{key: {**base.get(key, {}), **value} for key, value in changes.items()}})
+
+
+def test_a_bake_keeps_what_leaves_fibres(fur: Scene, tmp_path: Path) -> None:
+    data = ddprt.bake(fur, config=job(), out=tmp_path / "a")
+    assert data.description["exitant"] == ["fur"]
+    assert data.description["transport"]["integrator"] == "paths"
+    fibres = (data.gbuffer["albedo"] == 1).all(1)
+    assert fibres.sum() == 60 * TEXELS
+    maps = data.maps("indirect", range(5))
+    assert maps[:, fibres].mean() > 0
+    assert maps[:, ~fibres].mean() > 0
+    again = ddprt.bake(fur, config=job(), out=tmp_path / "a")  # all is there
+    np.testing.assert_array_equal(again.maps("indirect", range(5)), maps)
+    diffuse = ddprt.bake(force(fur, off=["hair"]), config=job())
+    assert "exitant" not in diffuse.description
+    assert diffuse.description["transport"]["integrator"] == "operator"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"transport": {"integrator": "operator"}}, "got hair, which would be taken for diffuse tubes"),
+        ({"transport": {"integrator": "reference"}}, "got hair, which would be taken for diffuse tubes"),
+        ({"transport": {"denoise": True}}, "transport.denoise: got true for a scene with hair"),
+        ({"probes": {"grid": [2, 2, 2]}}, "got hair beside probes, which is not simulated yet"),
+    ],
+)
+def test_what_knows_no_hair_is_refused_in_one_line(fur: Scene, change: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError, match=message) as caught:
+        ddprt.bake(fur, config=job(**change))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("part", "name"), [({"gloss": Gloss(0.3, 1.0)}, "gloss"), ({"emission": Emission((1.0, 1.0, 1.0))}, "emission")]
+)
+def test_what_is_beside_hair_is_refused_in_one_line(fur: Scene, part: dict[str, Any], name: str) -> None:
+    other = fur.made_of(lambda material: replace(material, **part) if material.name == "skin" else material)
+    with pytest.raises(UserError, match=f"got hair beside {name}, which is not simulated yet"):
+        ddprt.bake(other, config=job())
+
+
+def test_a_scene_without_strands_loads_nothing_of_hair(fur: Scene) -> None:
+    alone = bald(fur)
+    assert alone is not None
+    assert alone.tubes is None
+    assert len(alone.triangles) + fur.tubes.triangles == len(fur.triangles)  # type: ignore[union-attr]
+    assert bald(alone) is alone
