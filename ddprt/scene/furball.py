@@ -50,8 +50,13 @@ def furball(
     sideways = np.cross(outward, [0.36, 0.48, 0.8])
     beside = np.cross(outward, sideways)
     phase = (0.7548776662466927 * number)[:, None, None] % 1
-    wound = curl * share * (
-        np.sin(2 * np.pi * (share + phase)) * sideways[:, None] + np.cos(2 * np.pi * (1.3 * share + phase)) * beside[:, None]
+    wound = (
+        curl
+        * share
+        * (
+            np.sin(2 * np.pi * (share + phase)) * sideways[:, None]
+            + np.cos(2 * np.pi * (1.3 * share + phase)) * beside[:, None]
+        )
     )
     way = outward[:, None] * share + wound + 0.45 * share**2 * np.array([0.0, -1.0, 0.0])
     points = np.round(radius * outward[:, None] + length * way, 9)  # sines differ in their last bit among machines
@@ -60,7 +65,5 @@ def furball(
     start = (TEXELS + 1) * np.arange(strands + 1)
     fur = Strands(points.reshape(-1, 3), widths.ravel().copy(), start, np.tile(np.array(COLOUR, np.float32), (strands, 1)))
     directions, faces = icosphere(subdivisions)
-    skin = checked(
-        "furball", radius * directions, faces, normals=directions, materials=(Material("skin", (0.5, 0.35, 0.28)),)
-    )
+    skin = checked("furball", radius * directions, faces, normals=directions, materials=(Material("skin", (0.5, 0.35, 0.28)),))
     return with_strands(skin, "furball", fur, Material("fur", COLOUR, fibre=Fibre(along, around)))

@@ -113,7 +113,9 @@ def load_strands(path: Path, scale: float = 1.0) -> Strands:
 
 def _from_hair(name: str, data: bytes) -> Strands:
     if len(data) < _HEADER.size or data[:4] != b"HAIR":
-        raise UserError(f'{name}: got {len(data)} bytes that begin with {data[:4]!r}, expected "HAIR" and a header; export again')
+        raise UserError(
+            f'{name}: got {len(data)} bytes that begin with {data[:4]!r}, expected "HAIR" and a header; export again'
+        )
     _, strands, points, arrays, segments, thickness, _, *colour, _ = _HEADER.unpack_from(data)
     if not arrays & _POINTS:
         raise UserError(f"{name}: got a file without points, expected some; export it again")

@@ -138,7 +138,9 @@ class Hair:
         corners = ring_corners(tubes)
         rings = np.concatenate([tubes.axis[:, :, None], corners], 2) - tracer.centre
         colour = fibre.absorption_of(tubes.colour, material.around)
-        absorption = colour if material.absorption is None else np.tile(np.array(material.absorption, np.float64), (len(colour), 1))
+        absorption = (
+            colour if material.absorption is None else np.tile(np.array(material.absorption, np.float64), (len(colour), 1))
+        )
         reach = (CORNER * tubes.radius).ravel().astype(np.float32) + tracer.offset
         first = len(scene.triangles) - tubes.triangles
         rows = np.ascontiguousarray(rings.reshape(-1, 1 + SIDES, 3), np.float32)
@@ -301,7 +303,7 @@ def _look(
             own += beside[k] * (place[i, k] - centre)
             rows[k, i], rows[3 + k, i] = centre, across[k]
             frames[i, 0, k], frames[i, 1, k], frames[i, 2, k] = axis[k], across[k], beside[k]
-        offset[i] = min(max(2 * (own - least) / (most - least) - 1, -1.0), 1.0)
+        offset[i] = min(max(1 - 2 * (own - least) / (most - least), -1.0), 1.0)  # positive against `beside`, as angles turn
         for k in range(3):
             centre = (1 - share) * rings[low, 0, k] + share * rings[low + 1, 0, k]
             edge = (1 - share) * rings[low, 1, k] + share * rings[low + 1, 1, k] - centre

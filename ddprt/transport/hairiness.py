@@ -59,5 +59,7 @@ def refuse_beside(called: Callable[[str], bool], denoised: bool) -> None:
     found = [name for name in BESIDE if called(name)]
     if found or denoised:
         remedy = "ask for no probes" if found == ["probes"] else f'set effects.off = ["{found[0]}"]' if found else ""
-        what = f"effects: got hair beside {' and '.join(found)}" if found else "transport.denoise: got true for a scene with hair"
+        what = (
+            f"effects: got hair beside {' and '.join(found)}" if found else "transport.denoise: got true for a scene with hair"
+        )
         raise UserError(f"{what}, which is not simulated yet, expected one without the other; {remedy or 'set it to false'}")

@@ -111,9 +111,7 @@ def albedo_of(scene: Scene) -> Albedo:
     return lambda triangle, u, v: np.take(table, triangle, axis=0, mode="wrap")
 
 
-def starts(
-    tracer: Tracer, receivers: Receivers, tile: slice
-) -> Iterator[tuple[Rays, Int32[np.ndarray, " n"]]]:
+def starts(tracer: Tracer, receivers: Receivers, tile: slice) -> Iterator[tuple[Rays, Int32[np.ndarray, " n"]]]:
     """First rays of a tile's paths, some samples at a time, and where they start; owners count from the tile's start."""
     pattern, block, turn = receivers.pattern, receivers.block[tile], receivers.turn[tile]
     cosine, sine = turn.T
