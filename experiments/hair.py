@@ -2,9 +2,10 @@
 
     python experiments/hair.py [--quick] [--strands 1000 10000] [--samples 64] [--folder out]
 
-Prints, by number of strands, seconds and rays of the stages of a bake of 128 lightings, and the relative RMSE on held-out ones with
-4, 16 and 64 bases, linear and gamma. Writes hair-STRANDS.png: the ball lit from behind, from the side and from the camera; above
-as baked, direct and indirect light together, in the middle its indirect light alone, below that as learned with 16 bases.
+Prints, by number of strands, seconds and rays of the stages of a bake of 128 lightings, and the relative RMSE on held-out
+ones with 4, 16 and 64 bases, linear and gamma. Writes hair-STRANDS.png: the ball lit from behind, from the side and from the
+camera; above as baked, direct and indirect light together, in the middle its indirect light alone, below that as learned with
+16 bases.
 """
 
 import argparse
@@ -28,7 +29,7 @@ from ddprt.scene.atlas import Atlas
 from ddprt.scene.library import build
 from ddprt.scene.mesh import Scene
 from ddprt.transport.direct import centred, direct_irradiance
-from ddprt.transport.embree import Tracer, lifted
+from ddprt.transport.embree import Tracer
 from ddprt.transport.hair import Hair
 from ddprt.transport.openness import build_open_atlas
 from ddprt.transport.paths import trace_paths
@@ -53,7 +54,7 @@ def settings(strands: int, samples: int, quick: bool) -> dict[str, Any]:
 def learned(data: Dataset) -> dict[str, Any]:
     """Relative RMSE by space and bases, and the noise of what they are measured against."""
     test = data.split("test")
-    truth, values = Truth(data.maps("indirect", test), data.area), data.measured(test)
+    truth = Truth(data.maps("indirect", test), data.area)
     noise = data.maps("noise", test)
     square = float((noise.astype(np.float64) ** 2 * data.area[None, :, None]).sum() / truth.squares.sum())
     found: dict[str, Any] = {"noise of held-out maps": round(square**0.5, 4)}

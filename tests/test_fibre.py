@@ -32,7 +32,7 @@ def whole(held: np.ndarray, shape: np.ndarray) -> float:
 def test_a_white_fibre_keeps_its_energy(rough: tuple[float, float], sine: float) -> None:
     of = Fibre(*rough)
     for offset in (-0.95, 0.1, 0.7):
-        # The issue asks for 0.5 %. Bessel's series is good to 2e-7, and the sum over smooth lobes converges much faster than 1e-3.
+        # The issue asks for 0.5 %. Bessel's series is good to 2e-7, and the sum over smooth lobes to much better than 1e-3.
         assert whole(held_at(sine, offset, 1, of), fibre.shape_of(of)) == pytest.approx(1, abs=1e-3)
 
 

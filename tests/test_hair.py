@@ -131,7 +131,7 @@ def test_the_plan_names_strands_and_off_makes_them_diffuse(fur: Scene, cornell: 
     assert left_out.forced
     tracer = Tracer.of(off, 1)
     atlas, _ = build_open_atlas(tracer, off, 48)
-    np.testing.assert_allclose(atlas.albedo[-60 * TEXELS :], [[0.72, 0.42, 0.16]] * 60 * TEXELS)
+    np.testing.assert_allclose(atlas.albedo[-60 * TEXELS :], [[0.45, 0.18, 0.05]] * 60 * TEXELS)
 
 
 def job(**changes: Any) -> Config:

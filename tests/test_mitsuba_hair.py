@@ -1,8 +1,9 @@
 """Light among fibres against Mitsuba 3's `hair` on round curves: z-scores with both variances.
 
-Both models are Chiang's, and both scenes hold the same straight fibres. Mitsuba's are round splines (along its `linearcurve` shading
-frames do not follow the fibre in 3.9.1); ours are prisms, whose outlines are as wide in the mean over turns about the axis. What is compared is what leaves a texel of a fibre, averaged about it and over
-directions, of light that another fibre has scattered before.
+Both models are Chiang's, and both scenes hold the same straight fibres. Mitsuba's are round splines (along its `linearcurve`
+shading frames do not follow the fibre in 3.9.1); ours are prisms, whose outlines are as wide in the mean over turns about the
+axis. What is compared is what leaves a texel of a fibre, averaged about it and over directions, of light that another fibre
+has scattered before.
 """
 
 from pathlib import Path
@@ -63,7 +64,7 @@ def in_mitsuba(ends: np.ndarray, folder: Path) -> Any:
 
 
 def sent_out_by_mitsuba(scene: Any, ends: np.ndarray, tenth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pi times what leaves a tenth of each fibre: its own scattering draws a direction, and a path says what comes from there."""
+    """Pi times what leaves a tenth of each fibre: its scattering draws a direction, a path says what comes from there."""
     path = mi.load_dict({"type": "path", "hide_emitters": True, "max_depth": -1, "rr_depth": 64})
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(1)

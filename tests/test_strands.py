@@ -202,7 +202,7 @@ def test_each_strand_has_ten_texels_in_a_row(fur: Scene, skin: bool) -> None:
 
 
 def test_too_few_texels_are_refused_with_the_least_that_do(fur: Scene) -> None:
-    with pytest.raises(UserError, match="got 16, but the 30 strands of .*expected at least 20 and room") as caught:
+    with pytest.raises(UserError, match=r"got 16, but the 30 strands of .*expected at least 20 and room") as caught:
         square_beside(fur, 16)
     assert "\n" not in str(caught.value)
     assert square_beside(fur, 20) == 5

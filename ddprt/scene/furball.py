@@ -10,7 +10,7 @@ from ddprt.scene.shapes import icosphere
 from ddprt.scene.strands import Strands
 from ddprt.scene.tubes import TEXELS, with_strands
 
-COLOUR = (0.72, 0.42, 0.16)
+COLOUR = (0.45, 0.18, 0.05)
 _THIN, _MANY = 4e-5, 140_000  # radius of so many hairs; fewer are thicker, by the root of their number
 _TURN = np.pi * (3 - 5**0.5)  # from one root to the next, about the ball
 

@@ -1,7 +1,7 @@
 """Strands on the lightmap: each has its ten texels in a row, by arc length, as many strands in a row as there is room for.
 
-Nothing is unwrapped. Rows of strands follow below the square that the rest of the scene is unwrapped into; the strip to the right of
-that square stays empty. A texel is a tenth of its strand, all about it: its area is the fibre's side area.
+Nothing is unwrapped. Rows of strands follow below the square that the rest of the scene is unwrapped into; the strip to the
+right of that square stays empty. A texel is a tenth of its strand, all about it: its area is the fibre's side area.
 """
 
 from dataclasses import replace

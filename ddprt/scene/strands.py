@@ -1,7 +1,7 @@
 """Strands of hair or fur: curves with a radius and a colour each, and the files that they come in.
 
-Two formats are read. Our own is text, for what is made by hand or by a script; a line is `radius`, `colour`, `strand` or a point,
-and what follows a # is a remark:
+Two formats are read. Our own is text, for what is made by hand or by a script; a line is `radius`, `colour`, `strand` or a
+point, and what follows a # is a remark:
 
     radius 4e-05 1e-05        # of the strands that follow, metres: at the root and at the tip; one number for both
     colour 0.35 0.2 0.1       # of the strands that follow, linear Rec.709, 0 to 1: of much hair seen from afar
@@ -69,8 +69,8 @@ def checked_strands(name: str, strands: Strands) -> Strands:
             strand = int(np.searchsorted(strands.start, wrong[0], side="right")) - 1
             expected = "finite numbers above 0" if least == 0 else f"numbers below {FARTHEST:g}"
             raise UserError(
-                f"{name}: got {what} of {rows[wrong[0]].tolist()} m in strand {strand} ({len(wrong)} such), expected {expected}; "
-                "mend the file"
+                f"{name}: got {what} of {rows[wrong[0]].tolist()} m in strand {strand} ({len(wrong)} such), expected "
+                f"{expected}; mend the file"
             )
     if not ((strands.colour >= 0) & (strands.colour <= 1)).all():
         raise UserError(f"{name}: got a colour that is not three numbers 0 to 1; mend the file")
@@ -149,8 +149,10 @@ def _from_hair(name: str, data: bytes) -> Strands:
 
 
 def _from_text(name: str, data: bytes) -> Strands:
-    points, radii, shares, starts, colours, ends = [], [], [], [], [], []
-    colour, root, tip, line = COLOUR, RADIUS, RADIUS, 0
+    points, radii, shares = list[tuple[float, ...]](), list[float](), list[int]()
+    starts, colours, ends = list[int](), list[tuple[float, ...]](), list[tuple[float, float]]()
+    colour: tuple[float, ...] = COLOUR
+    root, tip, line = RADIUS, RADIUS, 0
     try:
         for line, text in enumerate(data.decode("utf-8").splitlines(), 1):  # noqa: B007 (told where it stops)
             words = text.partition("#")[0].split()
@@ -174,8 +176,8 @@ def _from_text(name: str, data: bytes) -> Strands:
                 shares.append(len(starts) - 1)
     except ValueError:
         raise UserError(
-            f"{name}, line {line}: expected radius and one or two numbers, colour and three, strand, or a point of three or four "
-            "after a strand; mend the file"
+            f"{name}, line {line}: expected radius and one or two numbers, colour and three, strand, or a point of three or "
+            "four after a strand; mend the file"
         ) from None
     start = np.array([*starts, len(points)], np.int64)
     owner, radius = np.array(shares, np.int64), np.array(radii, np.float64)

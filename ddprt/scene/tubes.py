@@ -1,8 +1,8 @@
 """Strands as tubes of triangles, which are traced, cut into texels and lit as any surface is.
 
 A tube is a prism of three sides whose perimeter is that of the round fibre, 2 pi r. So its side area is the fibre's; and
-since a convex outline is on average as wide as its perimeter over pi (Cauchy), it stops as much light: 2 r. Each strand is turned
-about its own axis by another angle. Pieces of a strand are of equal length, a whole number of them to a texel.
+since a convex outline is on average as wide as its perimeter over pi (Cauchy), it stops as much light: 2 r. Each strand is
+turned about its own axis by another angle. Pieces of a strand are of equal length, a whole number of them to a texel.
 """
 
 from dataclasses import replace

@@ -1,17 +1,17 @@
 """How a fibre scatters light: the model of Chiang et al., as compiled loops.
 
 A fibre is a dielectric cylinder with tilted scales. Light leaves it after p passes through its inside: reflected at the surface
-(R), through it (TT), reflected once within (TRT), and after all longer ways together. Each lobe is a product: of a longitudinal
-part, about the cone of specular reflection; of an azimuthal part, about the angle at which a ray that meets the fibre a share h of
-its radius off the axis leaves it; and of what Fresnel's law and absorption leave.
+(R), through it (TT), reflected once within (TRT), and after all longer ways together. Each lobe is a product: of a
+longitudinal part, about the cone of specular reflection; of an azimuthal part, about the angle at which a ray that meets the
+fibre a share h of its radius off the axis leaves it; and of what Fresnel's law and absorption leave.
 
 Directions are given in the fibre's frame: x along it towards the tip, y across it towards the viewer's side. What is called
-phase here is the radiance that leaves towards the viewer for each W/m² that arrives, on a plane that faces where it comes from,
-1/sr: over all directions of light it sums to 1 where nothing is absorbed. The model is not reciprocal: attenuation and tilt follow
-from the viewer's direction alone (as its authors say of the latter). Everything that uses it goes from viewer to light.
+phase here is the radiance that leaves towards the viewer for each W/m² that arrives, on a plane that faces where it comes
+from, 1/sr: over all directions of light it sums to 1 where nothing is absorbed. The model is not reciprocal: attenuation and
+tilt follow from the viewer's direction alone. Everything that uses it goes from viewer to light.
 
-Reference: Chiang, Bitterli, Tappan and Burley, "A Practical and Controllable Hair and Fur Model for Production Path Tracing", CGF
-35(2), 2016; d'Eon et al., "An Energy-Conserving Hair Reflectance Model", CGF 30(4), 2011, for the longitudinal part.
+Reference: Chiang, Bitterli, Tappan and Burley, "A Practical and Controllable Hair and Fur Model for Production Path Tracing",
+CGF 35(2), 2016; d'Eon et al., "An Energy-Conserving Hair Reflectance Model", CGF 30(4), 2011, for the longitudinal part.
 """
 
 import numpy as np
@@ -89,10 +89,10 @@ def sample(
 
 
 def gains(fibre: Fibre) -> Float64[np.ndarray, "clarities angles"]:
-    """What a fibre makes of light from some direction: what leaves it, to all sides and averaged about it, over what falls on it.
+    """What a fibre makes of light from some direction: what leaves it, to all sides and averaged about it, over what falls on.
 
-    Falling light is weighed by the cosine with the plane across the fibre, on either side. Rows are exp(-absorption) from 0 to 1,
-    columns the angle of the light with that plane, from -90 to 90 degrees in equal steps; the values are times its cosine, since
+    Falling light is weighed by the cosine with the plane across the fibre, on either side. Rows are exp(-absorption) from 0
+    to 1, columns the angle of the light with that plane, from -90 to 90 degrees in equal steps. Values are times its cosine:
     at grazing angles more leaves than falls on (and less at others): the model keeps energy from the viewer's side. To 2e-4.
     """
     shape = shape_of(fibre)

@@ -51,8 +51,8 @@ def valid_integrator(asked: str, scene: Scene) -> str:
     """The cheapest integrator that is valid for a scene's materials, where "auto" is asked for; else the one asked for.
 
     Raises:
-      UserError: the operator, which takes surfaces as diffuse, for a scene with gloss or hair, or the reference for hair. Leaving
-        these out is the user's to say, so that the plan tells of it.
+      UserError: the operator, which takes surfaces as diffuse, for a scene with gloss or hair, or the reference for hair.
+        Leaving these out is the user's to say, so that the plan tells of it.
     """
     users = [f'"{entry.name}"' for entry, chosen in zip(scene.materials, glossy(scene), strict=True) if chosen]
     if users and asked == "operator":

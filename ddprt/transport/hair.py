@@ -1,13 +1,15 @@
 """Hair on the way of light: where paths begin on strands or meet one, and what they carry on from there.
 
-A strand is traced as a prism (`ddprt.scene.tubes`) and scatters as the round fibre that it stands for (`ddprt.transport.fibre`).
-Where a ray meets the prism tells how far off the axis it passes: its place within the prism's outline as seen by the ray, which is
-as evenly spread as that of rays on a round fibre. What leaves the fibre starts on its axis, moved out of the prism across it.
+A strand is traced as a prism (`ddprt.scene.tubes`) and scatters as the round fibre that it stands for
+(`ddprt.transport.fibre`). Where a ray meets the prism tells how far off the axis it passes: its place within the prism's
+outline as seen by the ray, which is as evenly spread as that of rays on a round fibre. What leaves the fibre starts on its
+axis, moved out of the prism across it.
 
 A texel of a strand keeps pi times the radiance that leaves it, averaged about the fibre and over directions as a surface
-that they leave does, by the cosine with the plane across it: W/m², as the radiosity of its side area. By exchanging both integrals
-that is the light that falls on the fibre, weighed by what it makes of light from there (`fibre.gains`). Rays that leave the
-prism's faces by their cosine are spread as its outline is wide, and so the first rays of all paths are those of any surface.
+that they leave does, by the cosine with the plane across it: W/m², as the radiosity of its side area. By exchanging both
+integrals that is the light that falls on the fibre, weighed by what it makes of light from there (`fibre.gains`). Rays that
+leave the prism's faces by their cosine are spread as its outline is wide, and so the first rays of all paths are those of any
+surface.
 """
 
 from collections.abc import Iterator, Sequence
