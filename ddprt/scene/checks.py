@@ -213,13 +213,13 @@ def _reflects(name: str, material: Material, uv: np.ndarray | None) -> None:
     if gloss and not all(0 <= value <= 1 for value in (gloss.roughness, gloss.metallic, gloss.dielectric)):
         raise UserError(f"{name}: got {gloss} {of}, expected roughness, metallic and dielectric from 0 to 1; correct it")
     if (medium := material.subsurface) is not None:
-        shares, lengths = np.asarray(medium.albedo, np.float64), np.asarray(medium.mean_free_path, np.float64)
-        sound = shares.shape == lengths.shape == (3,) and ((shares >= 0) & (shares <= 1)).all()
-        sound = sound and ((lengths > 0) & (lengths < FARTHEST)).all() and -1 < medium.anisotropy < 1
+        shares, lengths = medium.albedo, medium.mean_free_path
+        sound = len(shares) == len(lengths) == 3 and all(0 <= share <= 1 for share in shares)
+        sound = sound and all(0 < length < FARTHEST for length in lengths) and -1 < medium.anisotropy < 1
         if not (sound and 1 <= medium.index <= DENSEST):
             raise UserError(
-                f"{name}: got {medium} {of}, expected three albedos from 0 to 1, three mean free paths above 0 m, an anisotropy "
-                f"between -1 and 1 and an index from 1 to {DENSEST:g}; correct it"
+                f"{name}: got {medium} {of}, expected three albedos from 0 to 1, three mean free paths above 0 m, an "
+                f"anisotropy between -1 and 1 and an index from 1 to {DENSEST:g}; correct it"
             )
     if material.cutout and not 0 <= material.cutout.cutoff <= 1:
         raise UserError(f"{name}: got cutoff {material.cutout.cutoff:g} {of}, expected 0 to 1; correct it")
@@ -250,8 +250,8 @@ def _holds_media(
             edges, first = rims(places[own])
             x, y, z = corners[own[first // 3], first % 3].round(4).tolist()
             raise UserError(
-                f"{name}: got {edges} open edges on a surface of material {of} the first at ({x:g}, {y:g}, {z:g}) m, expected a "
-                "closed one, which light does not leak from; close or weld the mesh, or take the medium out of the material"
+                f"{name}: got {edges} open edges on a surface of material {of} the first at ({x:g}, {y:g}, {z:g}) m, expected "
+                "a closed one, which light does not leak from; close or weld the mesh, or take the medium out of the material"
             )
         if len(others := np.unique(material[own])) > 1:
             found = ", ".join(f'"{materials[index].name}"' for index in others)

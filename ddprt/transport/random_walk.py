@@ -14,10 +14,11 @@ it lost on the way, x / sinh x with x = (radius + 0.71 free paths) / the diffusi
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from ddprt.axes import Float, Float32, Float64, Int, Int32
+from ddprt.axes import Float, Float32, Float64, Int32
 from ddprt.compiled import compiled
 from ddprt.scene.material import Subsurface
 from ddprt.transport.packets import Geometry
@@ -155,6 +156,10 @@ class Body:
         out = np.empty((count, 6), np.float32), np.empty((count, 2), np.float32), np.empty((count, 2), np.int32)
         numbers_each, left, lost, steps, turn = 8 if self.depth.size > 1 else 5, 0, 0, 0, 0
         far = np.float32(FAR / self.extinction[1].min())
+        bends = np.float32(self.anisotropy), np.float32(self.index), self.switch
+        surface = self.normals, self.corners, np.float32(self.offset)
+        grid = self.depth, self.low, np.float32(self.cell), self.bounds, far
+        constants: tuple[Any, ...] = self.extinction, self.albedo, self.decay, *bends, *surface, *grid
         while count and turn < _MOST:
             parts = tuple(part[:count] for part in (*state, owner, order))
             position, direction, now, own, times = parts
@@ -163,10 +168,8 @@ class Body:
             _fly(now, times, self.extinction, self.switch, numbers, reach)
             triangle, u, v, reach = self.geometry.first(position, direction, reach)
             steps, turn = steps + count, turn + 1
-            hits = triangle, u, v, reach, numbers
-            medium = self.extinction, self.albedo, self.decay, np.float32(self.anisotropy), np.float32(self.index), self.switch
-            shape = self.normals, self.corners, np.float32(self.offset), self.depth, self.low, np.float32(self.cell), self.bounds
-            count, left, gone = _step(position, direction, now, own, times, *hits, *medium, *shape, far, left, *out)
+            hits: tuple[Any, ...] = triangle, u, v, reach, numbers
+            count, left, gone = _step(position, direction, now, own, times, *hits, *constants, left, *out)
             lost += gone
         flat, weights, which = (part[:left] for part in out)
         return Exits(
@@ -215,37 +218,6 @@ def depths(
     return np.maximum(distance - step, 0).reshape(size).astype(np.float32), cell
 
 
-def entered(
-    outwards: Float32[np.ndarray, "n 3"], normals: Float32[np.ndarray, "n 3"], index: float
-) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, " n"]]:
-    """Where light from outside goes on inside, and the share of it that enters.
-
-    Args:
-      outwards: unit, towards where it comes from.
-      normals: unit, outwards.
-      index: relative.
-    """
-    cosine = np.einsum("nd,nd->n", outwards, normals)
-    if index == 1:
-        return -outwards, np.ones(len(outwards), np.float32)
-    inner = np.sqrt(1 - (1 - cosine**2) / index**2)
-    inwards = (cosine[:, None] * normals - outwards) / np.float32(index) - inner[:, None] * normals
-    return inwards.astype(np.float32), (1 - fresnel(cosine, inner, index)).astype(np.float32)
-
-
-def fresnel(outer: Float[np.ndarray, " n"], inner: Float[np.ndarray, " n"], index: float) -> Float[np.ndarray, " n"]:
-    """Reflectance of a smooth boundary, unpolarised, by the cosines on both sides."""
-    across, along = (outer - index * inner) / (outer + index * inner), (index * outer - inner) / (index * outer + inner)
-    return (across**2 + along**2) / 2
-
-
-def mean_entering(index: float) -> float:
-    """Share of light from everywhere that enters: the integral of the transmittance over the hemisphere."""
-    squared = np.linspace(0, 1, 4097)[1:] - 1 / 8192  # of cosines: their density is even
-    outer = np.sqrt(squared)
-    return float(1 - fresnel(outer, np.sqrt(1 - (1 - squared) / index**2), index).mean()) if index > 1 else 1.0
-
-
 def sample_henyey(u: Float64[np.ndarray, " n"], anisotropy: float) -> Float64[np.ndarray, " n"]:
     """Cosines of the angle of scattering, as walks draw them."""
     return np.array([_henyey(np.float32(one), np.float32(anisotropy)) for one in u], np.float64)
@@ -275,7 +247,9 @@ def _henyey(u: np.float32, g: np.float32) -> np.float32:
 
 
 @compiled
-def _fly(weight: np.ndarray, order: np.ndarray, extinction: np.ndarray, switch: int, numbers: np.ndarray, reach: np.ndarray) -> None:
+def _fly(
+    weight: np.ndarray, order: np.ndarray, extinction: np.ndarray, switch: int, numbers: np.ndarray, reach: np.ndarray
+) -> None:
     """How far each walk would fly: by the chance of a channel that is drawn by weight."""
     for i in range(len(reach)):
         stage = 1 if order[i] >= switch else 0
@@ -374,7 +348,11 @@ def _step(
             x, y, z = _turned(x, y, z, _henyey(numbers[i, 2], g), numbers[i, 3])
             if jumping and order[i] + 1 >= switch:
                 k, m_, n_ = int((px - low[0]) / cell), int((py - low[1]) / cell), int((pz - low[2]) / cell)
-                k, m_, n_ = min(max(k, 0), depth.shape[0] - 1), min(max(m_, 0), depth.shape[1] - 1), min(max(n_, 0), depth.shape[2] - 1)
+                k, m_, n_ = (
+                    min(max(k, 0), depth.shape[0] - 1),
+                    min(max(m_, 0), depth.shape[1] - 1),
+                    min(max(n_, 0), depth.shape[2] - 1),
+                )
                 half = np.float32(0.5)
                 dx, dy = px - low[0] - (k + half) * cell, py - low[1] - (m_ + half) * cell
                 dz = pz - low[2] - (n_ + half) * cell
