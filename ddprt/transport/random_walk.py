@@ -1,16 +1,17 @@
 """Random walks of light through a homogeneous medium that fills a closed body, from the surface to the surface.
 
-All walks of a call take their steps together: compiled code draws how far each flies, Embree tells whether the surface comes
-first, compiled code scatters, refracts or ends them. One walk serves all channels: for each flight a channel is drawn in
-proportion to the walk's weights, and each weight is multiplied by what its own channel's chance would have been over that of
-the draw (the balance heuristic). So no weight leaves its bounds: their sum never grows.
+Compiled code draws how far each walk flies, and scatters it, for as long as it surely stays inside; Embree tells whether the
+surface comes first where it may, for all walks of a call together. One walk serves all channels: for each flight a channel is
+drawn in proportion to the walk's weights, and each weight is multiplied by its own channel's chance over that of the draw (the
+balance heuristic). So no weight leaves its bounds: their sum never grows.
 
-A thick body would keep walks for ever. Two things shorten them: once a direction is forgotten (the anisotropy to the power of
-the scatterings is below `_FORGOTTEN`) the medium becomes the similar one that scatters evenly, sigma_s' = (1 - g) sigma_s; and
+A thick body would keep walks for ever. Two things shorten them. Once a direction is forgotten (the anisotropy to the power of
+the scatterings is below `_FORGOTTEN`) the medium becomes the similar one that scatters evenly, sigma_s' = (1 - g) sigma_s. And
 where the surface is further than `FAR` of its free paths, a walk goes at once to a sphere about it that just fits, where it
-comes first with equal odds everywhere: a step of the walk on spheres for diffusion (Muller 1956), as few as log(depth). What
-it lost on the way, x / sinh x with x = (radius + 0.71 free paths) / the diffusion length, is exact far from start and end
-(see `weight_of_jump`). Light weaker than `_FAINT` plays roulette.
+comes first with equal odds everywhere: a step of the walk on spheres for diffusion (Muller, "Some Continuous Monte Carlo
+Methods for the Dirichlet Problem", 1956). What it lost on the way is x / sinh x with x = (radius + 0.71 free paths) / the
+diffusion length (see `weight_of_jump`), and directions there lean outwards as in Milne's problem. Both are measured in
+docs/effects.md. Light weaker than `_FAINT` plays roulette.
 """
 
 from dataclasses import dataclass
@@ -23,16 +24,23 @@ from ddprt.compiled import compiled
 from ddprt.scene.material import Subsurface
 from ddprt.transport.packets import Geometry
 
-FAR = 8.0
-"""Free paths between a walk and the surface from which on it jumps."""
+FAR = 3.0
+"""Free paths between a walk and the surface from which on it jumps: there the weight is off by 1e-4 where a meeting leaves 99 %
+of the light, by 6e-3 where it leaves 95 %."""
+
+WHITE = 0.9
+"""Least albedo of a channel with which walks jump; darker ones end before they get that far."""
+
+LEANING = 0.707, 0.26
+"""Mean cosine, to the normal, of light that comes first to a sphere: Milne's, and what 1 / (radius in free paths) adds."""
 
 EXTRAPOLATED = 0.7104
 """Free paths by which diffusion's boundary lies outside: Milne's constant."""
 
 _FORGOTTEN = 0.05
 _FAINT = 0.5  # of a sum of three weights
-_CELLS = 40  # of the grid of depths, along the body's longest side
-_MOST = 200_000  # steps of a walk; only a white body in which light is caught reaches them
+_CELLS = 64  # of the grid of depths, along the body's longest side, at most
+_MOST = 200_000  # rays of a walk; only a white body in which light is caught reaches them
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +52,7 @@ class Exits:
       triangle, u, v: of the body's boundary.
       direction: unit, outwards, after refraction.
       weight: what is left, per channel.
-      steps: flights of all walks together, each a ray.
+      rays: of all walks together.
       lost: walks that slipped through a seam, or never ended.
     """
 
@@ -54,7 +62,7 @@ class Exits:
     v: Float32[np.ndarray, " exits"]
     direction: Float32[np.ndarray, "exits 3"]
     weight: Float32[np.ndarray, "exits 3"]
-    steps: int
+    rays: int
     lost: int
 
 
@@ -71,7 +79,8 @@ class Body:
       decay: 1 / diffusion length of the similar one, 1/m.
       anisotropy, index: see `Subsurface`.
       switch: scatterings after which a walk goes through the similar medium.
-      depth: lower bounds of the distance from cell centres to the surface, metres; a single 0 where no walk ever jumps.
+      far: depth from which on it jumps, metres.
+      depth: lower bounds of the distance from cell centres to the surface, metres.
       low, cell: corner of that grid and edge of its cells, metres.
       bounds: of the corners, with a margin.
     """
@@ -86,6 +95,7 @@ class Body:
     anisotropy: float
     index: float
     switch: int
+    far: float
     depth: Float32[np.ndarray, "x y z"]
     low: Float32[np.ndarray, "3"]
     cell: float
@@ -113,11 +123,9 @@ class Body:
         g = abs(medium.anisotropy)
         switch = 0 if g == 0 else int(np.ceil(np.log(_FORGOTTEN) / np.log(g)))
         low, high = corners.min((0, 1)), corners.max((0, 1))
-        reach = FAR / float(similar.min())
-        if jumps and (high - low).min() > 2 * reach:
-            depth, cell = depths(corners, low, high)
-        else:
-            depth, cell = np.zeros((1, 1, 1), np.float32), 1.0
+        far = FAR / float(similar.min()) if jumps and even.min() >= WHITE else np.inf
+        finest = max(float((high - low).max()) / _CELLS, 0.5 / float(similar.max()))
+        depth, cell = depths(corners, low, high, finest)
         bounds = np.stack([low, high]) + np.array([[-10.0], [10.0]]) * offset
         return cls(
             Geometry(corners),
@@ -130,6 +138,7 @@ class Body:
             medium.anisotropy,
             medium.index,
             switch if jumps else np.iinfo(np.int32).max,
+            far,
             depth,
             low.astype(np.float32),
             cell,
@@ -151,31 +160,33 @@ class Body:
           rng: of this call alone.
         """
         count = len(origins)
-        state = origins.copy(), directions.copy(), weight.copy()
-        owner, order = np.arange(count, dtype=np.int32), np.zeros(count, np.int32)
+        state: tuple[Any, ...] = (
+            origins.copy(),
+            directions.copy(),
+            weight.copy(),
+            np.arange(count, dtype=np.int32),
+            np.zeros(count, np.int32),
+        )
+        state = *state, rng.integers(0, 1 << 64, count, np.uint64)
         out = np.empty((count, 6), np.float32), np.empty((count, 2), np.float32), np.empty((count, 2), np.int32)
-        numbers_each, left, lost, steps, turn = 8 if self.depth.size > 1 else 5, 0, 0, 0, 0
-        far = np.float32(FAR / self.extinction[1].min())
+        triangle, u, v, reach = np.empty(count, np.int32), *np.empty((3, count), np.float32)
         bends = np.float32(self.anisotropy), np.float32(self.index), self.switch
         surface = self.normals, self.corners, np.float32(self.offset)
-        grid = self.depth, self.low, np.float32(self.cell), self.bounds, far
+        grid = self.depth, self.low, np.float32(self.cell), self.bounds, np.float32(self.far)
         constants: tuple[Any, ...] = self.extinction, self.albedo, self.decay, *bends, *surface, *grid
+        hits: tuple[Any, ...] = triangle, u, v, reach, True
+        count, left, lost = _advance(*state, *hits, *constants, 0, *out)
+        rays, turn = 0, 0
         while count and turn < _MOST:
-            parts = tuple(part[:count] for part in (*state, owner, order))
-            position, direction, now, own, times = parts
-            numbers = rng.random((count, numbers_each), np.float32)
-            reach = np.empty(count, np.float32)
-            _fly(now, times, self.extinction, self.switch, numbers, reach)
-            triangle, u, v, reach = self.geometry.first(position, direction, reach)
-            steps, turn = steps + count, turn + 1
-            hits: tuple[Any, ...] = triangle, u, v, reach, numbers
-            count, left, gone = _step(position, direction, now, own, times, *hits, *constants, left, *out)
+            state = tuple(part[:count] for part in state)
+            triangle, u, v, reach = self.geometry.first(state[0], state[1], reach[:count])
+            rays, turn = rays + count, turn + 1
+            hits = triangle, u, v, reach, False
+            count, left, gone = _advance(*state, *hits, *constants, left, *out)
             lost += gone
         flat, weights, which = (part[:left] for part in out)
-        return Exits(
-            which[:, 0].copy(), which[:, 1].copy(), weights[:, 0].copy(), weights[:, 1].copy(),
-            flat[:, :3].copy(), flat[:, 3:].copy(), steps, lost + count,
-        )  # fmt: skip
+        at, towards = weights.T.copy(), flat[:, :3].copy()
+        return Exits(which[:, 0].copy(), which[:, 1].copy(), at[0], at[1], towards, flat[:, 3:].copy(), rays, lost + count)
 
 
 def decay_rate(albedo: float) -> float:
@@ -196,7 +207,7 @@ def weight_of_jump(radius: float, extinction: float, albedo: float) -> float:
 
 
 def depths(
-    corners: Float32[np.ndarray, "triangles 3 3"], low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]
+    corners: Float32[np.ndarray, "triangles 3 3"], low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], cell: float
 ) -> tuple[Float32[np.ndarray, "x y z"], float]:
     """Lower bounds of the distance from the centres of cubic cells to a surface, and the edge of the cells, metres.
 
@@ -204,7 +215,6 @@ def depths(
     """
     from scipy.spatial import cKDTree
 
-    cell = float((high - low).max()) / _CELLS
     size = np.ceil((high - low) / cell).astype(int) + 1
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
     cuts, spread = np.maximum(np.ceil(longest / cell), 1).astype(int), []
@@ -213,7 +223,7 @@ def depths(
         weights = np.stack([i, j, number - i - j], -1)[i + j <= number] / number
         spread.append(np.einsum("kc,tcd->tkd", weights, corners[cuts == number]).reshape(-1, 3))
     centres = np.stack(np.meshgrid(*(np.arange(count) + 0.5 for count in size), indexing="ij"), -1) * cell + low
-    distance, _ = cKDTree(np.concatenate(spread)).query(centres.reshape(-1, 3))
+    distance, _ = cKDTree(np.concatenate(spread)).query(centres.reshape(-1, 3), workers=-1)
     step = float((longest / cuts).max()) / 3**0.5
     return np.maximum(distance - step, 0).reshape(size).astype(np.float32), cell
 
@@ -247,15 +257,25 @@ def _henyey(u: np.float32, g: np.float32) -> np.float32:
 
 
 @compiled
-def _fly(
-    weight: np.ndarray, order: np.ndarray, extinction: np.ndarray, switch: int, numbers: np.ndarray, reach: np.ndarray
-) -> None:
-    """How far each walk would fly: by the chance of a channel that is drawn by weight."""
-    for i in range(len(reach)):
-        stage = 1 if order[i] >= switch else 0
-        pick = numbers[i, 0] * (weight[i, 0] + weight[i, 1] + weight[i, 2])
-        channel = 0 if pick < weight[i, 0] else (1 if pick < weight[i, 0] + weight[i, 1] else 2)
-        reach[i] = -np.log(np.float32(1) - numbers[i, 1]) / extinction[stage, channel]
+def _drawn(state: np.ndarray, i: int) -> np.float32:
+    """The next of a walk's own uniform numbers (SplitMix64)."""
+    state[i] += np.uint64(0x9E3779B97F4A7C15)
+    bits = state[i]
+    bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return np.float32((bits ^ (bits >> np.uint64(31))) >> np.uint64(40)) * np.float32(2**-24)
+
+
+@compiled
+def _free(x: np.float32, y: np.float32, z: np.float32, depth: np.ndarray, low: np.ndarray, cell: np.float32) -> np.float32:
+    """A lower bound of the distance to the surface."""
+    half = np.float32(0.5)
+    p, q, r = (x - low[0]) / cell, (y - low[1]) / cell, (z - low[2]) / cell
+    i, j, k = int(p), int(q), int(r)
+    if p < 0 or q < 0 or r < 0 or i >= depth.shape[0] or j >= depth.shape[1] or k >= depth.shape[2]:
+        return np.float32(0)
+    p, q, r = p - i - half, q - j - half, r - k - half
+    return depth[i, j, k] - cell * np.sqrt(p * p + q * q + r * r)
 
 
 @compiled
@@ -275,107 +295,135 @@ def _turned(x: np.float32, y: np.float32, z: np.float32, cosine: np.float32, tur
 
 
 @compiled
-def _step(
-    position: np.ndarray, direction: np.ndarray, weight: np.ndarray, owner: np.ndarray, order: np.ndarray,
-    triangle: np.ndarray, u: np.ndarray, v: np.ndarray, reach: np.ndarray, numbers: np.ndarray,
-    extinction: np.ndarray, albedo: np.ndarray, decay: np.ndarray, anisotropy: np.float32, index: np.float32, switch: int,
-    normals: np.ndarray, corners: np.ndarray, offset: np.float32, depth: np.ndarray, low: np.ndarray, cell: np.float32,
-    bounds: np.ndarray, far: np.float32, left: int, flat: np.ndarray, weights: np.ndarray, which: np.ndarray,
-) -> tuple:  # fmt: skip
-    """Scatters each walk, or lets it out, or reflects it; keeps those that go on, in order.
+def _advance(
+    position: np.ndarray,
+    direction: np.ndarray,
+    weight: np.ndarray,
+    owner: np.ndarray,
+    order: np.ndarray,
+    state: np.ndarray,
+    triangle: np.ndarray,
+    u: np.ndarray,
+    v: np.ndarray,
+    reach: np.ndarray,
+    fresh: bool,
+    extinction: np.ndarray,
+    albedo: np.ndarray,
+    decay: np.ndarray,
+    anisotropy: np.float32,
+    index: np.float32,
+    switch: int,
+    normals: np.ndarray,
+    corners: np.ndarray,
+    offset: np.float32,
+    depth: np.ndarray,
+    low: np.ndarray,
+    cell: np.float32,
+    bounds: np.ndarray,
+    far: np.float32,
+    left: int,
+    flat: np.ndarray,
+    weights: np.ndarray,
+    which: np.ndarray,
+) -> tuple:
+    """Takes each walk from what its ray met, if it is not fresh, to where it needs the next; keeps those that do, in order.
 
     Returns:
       How many go on, how many have left so far, how many were lost.
     """
-    zero, one = np.float32(0), np.float32(1)
-    count, lost, jumping = 0, 0, depth.size > 1
-    for i in range(len(reach)):
-        stage = 1 if order[i] >= switch else 0
-        t, hit = reach[i], triangle[i]
+    zero, one, two = np.float32(0), np.float32(1), np.float32(2)
+    faint, milne = np.float32(_FAINT), np.float32(EXTRAPOLATED)
+    count, lost = 0, 0
+    for i in range(len(triangle)):
+        px, py, pz = position[i, 0], position[i, 1], position[i, 2]
         x, y, z = direction[i, 0], direction[i, 1], direction[i, 2]
-        least = min(extinction[stage, 0], extinction[stage, 1], extinction[stage, 2])
-        red = np.exp((least - extinction[stage, 0]) * t)
-        green = np.exp((least - extinction[stage, 1]) * t)
-        blue = np.exp((least - extinction[stage, 2]) * t)
-        if hit < 0:
-            red, green, blue = red * extinction[stage, 0], green * extinction[stage, 1], blue * extinction[stage, 2]
         a, b, c = weight[i, 0], weight[i, 1], weight[i, 2]
-        share = (a + b + c) / (a * red + b * green + c * blue)
-        a, b, c = a * red * share, b * green * share, c * blue * share
-        if hit >= 0:
-            m, n, o = normals[hit, 0], normals[hit, 1], normals[hit, 2]
-            cosine = x * m + y * n + z * o
-            if not cosine > zero:
-                lost += 1
+        times, met, free = order[i], not fresh, zero
+        while True:
+            stage = 1 if times >= switch else 0
+            if met:
+                t, hit = reach[i], triangle[i]
+                met = False
+            else:
+                pick = _drawn(state, i) * (a + b + c)
+                channel = 0 if pick < a else (1 if pick < a + b else 2)
+                t, hit = -np.log(one - _drawn(state, i)) / extinction[stage, channel], np.int32(-1)
+                if t >= free:
+                    position[count, 0], position[count, 1], position[count, 2] = px, py, pz
+                    direction[count, 0], direction[count, 1], direction[count, 2] = x, y, z
+                    weight[count, 0], weight[count, 1], weight[count, 2] = a, b, c
+                    owner[count], order[count], state[count], reach[count] = owner[i], times, state[i], t
+                    count += 1
+                    break
+            least = min(extinction[stage, 0], extinction[stage, 1], extinction[stage, 2])
+            red = np.exp((least - extinction[stage, 0]) * t)
+            green = np.exp((least - extinction[stage, 1]) * t)
+            blue = np.exp((least - extinction[stage, 2]) * t)
+            if hit < 0:
+                red, green, blue = red * extinction[stage, 0], green * extinction[stage, 1], blue * extinction[stage, 2]
+            share = (a + b + c) / (a * red + b * green + c * blue)
+            a, b, c = a * red * share, b * green * share, c * blue * share
+            if hit >= 0:
+                m, n, o = normals[hit, 0], normals[hit, 1], normals[hit, 2]
+                cosine = x * m + y * n + z * o
+                if not cosine > zero:
+                    lost += 1
+                    break
+                outer, reflected = cosine, zero
+                if index > one:
+                    squared = one - index * index * (one - cosine * cosine)
+                    outer, reflected = np.sqrt(max(squared, zero)), one
+                    if squared > zero:
+                        across = (outer - index * cosine) / (outer + index * cosine)
+                        along = (index * outer - cosine) / (index * outer + cosine)
+                        reflected = (across * across + along * along) / two
+                if _drawn(state, i) >= reflected:
+                    which[left, 0], which[left, 1] = owner[i], hit
+                    weights[left, 0], weights[left, 1] = u[i], v[i]
+                    bend = outer - index * cosine
+                    flat[left, 0], flat[left, 1] = index * x + bend * m, index * y + bend * n
+                    flat[left, 2] = index * z + bend * o
+                    flat[left, 3], flat[left, 4], flat[left, 5] = a, b, c
+                    left += 1
+                    break
+                p, q = u[i], v[i]
+                r = one - p - q
+                px = r * corners[hit, 0, 0] + p * corners[hit, 1, 0] + q * corners[hit, 2, 0] - offset * m
+                py = r * corners[hit, 0, 1] + p * corners[hit, 1, 1] + q * corners[hit, 2, 1] - offset * n
+                pz = r * corners[hit, 0, 2] + p * corners[hit, 1, 2] + q * corners[hit, 2, 2] - offset * o
+                x, y, z = x - two * cosine * m, y - two * cosine * n, z - two * cosine * o
+                free = zero
                 continue
-            outer, reflected = cosine, zero
-            if index > one:
-                squared = one - index * index * (one - cosine * cosine)
-                outer, reflected = np.sqrt(max(squared, zero)), one
-                if squared > zero:
-                    across = (outer - index * cosine) / (outer + index * cosine)
-                    along = (index * outer - cosine) / (index * outer + cosine)
-                    reflected = (across * across + along * along) / np.float32(2)
-            if numbers[i, 2] >= reflected:
-                which[left, 0], which[left, 1] = owner[i], hit
-                weights[left, 0], weights[left, 1] = u[i], v[i]
-                bend = outer - index * cosine
-                flat[left, 0], flat[left, 1], flat[left, 2] = index * x + bend * m, index * y + bend * n, index * z + bend * o
-                flat[left, 3], flat[left, 4], flat[left, 5] = a, b, c
-                left += 1
-                continue
-            for axis in range(3):
-                first = corners[hit, 0, axis]
-                place = first + u[i] * (corners[hit, 1, axis] - first) + v[i] * (corners[hit, 2, axis] - first)
-                position[count, axis] = place - offset * normals[hit, axis]
-            direction[count, 0], direction[count, 1] = x - 2 * cosine * m, y - 2 * cosine * n
-            direction[count, 2] = z - 2 * cosine * o
-            order[count] = order[i]
-        else:
             a, b, c = a * albedo[stage, 0], b * albedo[stage, 1], c * albedo[stage, 2]
-            px, py, pz = position[i, 0] + t * x, position[i, 1] + t * y, position[i, 2] + t * z
+            px, py, pz = px + t * x, py + t * y, pz + t * z
             outside = px < bounds[0, 0] or py < bounds[0, 1] or pz < bounds[0, 2]
             if outside or px > bounds[1, 0] or py > bounds[1, 1] or pz > bounds[1, 2]:
                 lost += 1
-                continue
+                break
             total = a + b + c
-            if total < np.float32(_FAINT):
-                if numbers[i, 4] * np.float32(_FAINT) >= total:
-                    continue
-                share = np.float32(_FAINT) / total
+            if total < faint:
+                if _drawn(state, i) * faint >= total:
+                    break
+                share = faint / total
                 a, b, c = a * share, b * share, c * share
-            g = zero if stage else anisotropy
-            x, y, z = _turned(x, y, z, _henyey(numbers[i, 2], g), numbers[i, 3])
-            if jumping and order[i] + 1 >= switch:
-                k, m_, n_ = int((px - low[0]) / cell), int((py - low[1]) / cell), int((pz - low[2]) / cell)
-                k, m_, n_ = (
-                    min(max(k, 0), depth.shape[0] - 1),
-                    min(max(m_, 0), depth.shape[1] - 1),
-                    min(max(n_, 0), depth.shape[2] - 1),
-                )
-                half = np.float32(0.5)
-                dx, dy = px - low[0] - (k + half) * cell, py - low[1] - (m_ + half) * cell
-                dz = pz - low[2] - (n_ + half) * cell
-                free = depth[k, m_, n_] - np.sqrt(dx * dx + dy * dy + dz * dz)
-                if free > far:
-                    # Evenly anywhere on the sphere, and on from there as Milne's light leaves a thick wall: mu (mu + 0.71).
-                    x, y, z = _turned(zero, zero, one, np.float32(2) * numbers[i, 2] - one, numbers[i, 3])
-                    px, py, pz = px + free * x, py + free * y, pz + free * z
-                    some = np.sqrt(numbers[i, 5])
-                    if numbers[i, 6] < np.float32(1 / 3 / (1 / 3 + EXTRAPOLATED / 2)):
-                        some = numbers[i, 5] ** np.float32(1 / 3)
-                    x, y, z = _turned(x, y, z, some, numbers[i, 7])
-                    a *= _survival(decay[0] * (free + np.float32(EXTRAPOLATED) / extinction[1, 0]))
-                    b *= _survival(decay[1] * (free + np.float32(EXTRAPOLATED) / extinction[1, 1]))
-                    c *= _survival(decay[2] * (free + np.float32(EXTRAPOLATED) / extinction[1, 2]))
-                    if not a + b + c > zero:
-                        continue
-            position[count, 0], position[count, 1], position[count, 2] = px, py, pz
-            direction[count, 0], direction[count, 1], direction[count, 2] = x, y, z
-            order[count] = min(order[i] + 1, 1 << 30)
-        weight[count, 0], weight[count, 1], weight[count, 2] = a, b, c
-        owner[count] = owner[i]
-        count += 1
+            cosine = _henyey(_drawn(state, i), zero if stage else anisotropy)
+            x, y, z = _turned(x, y, z, cosine, _drawn(state, i))
+            times += 1
+            free = _free(px, py, pz, depth, low, cell)
+            if free > far and times >= switch:
+                # Evenly anywhere on the sphere, and on from there as light leaves a thick wall.
+                x, y, z = _turned(zero, zero, one, two * _drawn(state, i) - one, _drawn(state, i))
+                px, py, pz = px + free * x, py + free * y, pz + free * z
+                widest = max(one / extinction[1, 0], one / extinction[1, 1], one / extinction[1, 2])
+                mean = np.float32(LEANING[0]) + np.float32(LEANING[1]) * widest / free
+                power = (one - mean) / mean  # of a density mu^k with that mean: k + 1 = mean / (1 - mean)
+                x, y, z = _turned(x, y, z, _drawn(state, i) ** power, _drawn(state, i))
+                a *= _survival(decay[0] * (free + milne / extinction[1, 0]))
+                b *= _survival(decay[1] * (free + milne / extinction[1, 1]))
+                c *= _survival(decay[2] * (free + milne / extinction[1, 2]))
+                free = _free(px, py, pz, depth, low, cell)
+                if not a + b + c > zero:
+                    break
     return count, left, lost
 
 

@@ -63,8 +63,9 @@ class Reflection:
         """The same on coarse blocks; light goes through bodies between senders, since it may not get far."""
         sent = self.coarse * light
         if self.passage:
+            assert self.home is not None and self.share is not None
             passed = self.leaving * self.passage.of((finer[self.bodies] @ light).astype(np.float32))
-            np.add.at(sent, self.home, self.share[:, None] * passed)  # type: ignore[arg-type]
+            np.add.at(sent, self.home, self.share[:, None] * passed)
         return sent
 
     def arrived(self, *light: Float32[np.ndarray, "senders columns"]) -> Float32[np.ndarray, "inside columns"] | None:

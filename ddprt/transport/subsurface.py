@@ -161,7 +161,7 @@ class Inside:
 
         def work(tile: slice) -> tuple[tuple[Matrix, Matrix, Matrix], int]:
             rng = seeds.stream(seed, "inside", *stream.encode(), receivers.samples, int(receivers.patch[tile.start]))
-            count, parts, steps = tile.stop - tile.start, list[tuple[np.ndarray, np.ndarray, np.ndarray]](), 0
+            count, parts, rays = tile.stop - tile.start, list[tuple[np.ndarray, np.ndarray, np.ndarray]](), 0
             for owner, places, towards, triangle in _starts(self.tracer, receivers, tile):
                 for number, (body, own) in enumerate(self.bodies):
                     of = np.flatnonzero(self.body[triangle] == number)
@@ -175,11 +175,11 @@ class Inside:
                     cells = landed_on(self.tracer, self.landing, -out, own[found.triangle], found.u, found.v)
                     lit = np.flatnonzero(cells >= 0)
                     parts.append((owner[of][found.owner[lit]], cells[lit], found.weight[lit]))
-                    steps += found.steps
-            return _sparse(parts, (count, len(self.senders)), receivers.samples), steps
+                    rays += found.rays
+            return _sparse(parts, (count, len(self.senders)), receivers.samples), rays
 
-        for rows, steps in self.tracer.map(work, receivers.tiles()):
-            self.tracer.rays += steps  # by the one who waits for all others
+        for rows, rays in self.tracer.map(work, receivers.tiles()):
+            self.tracer.rays += rays  # by the one who waits for all others
             yield rows
 
     def entering(
