@@ -22,6 +22,7 @@ import numpy as np
 from ddprt.axes import Float, Float32, Float64, Int32
 from ddprt.compiled import compiled
 from ddprt.scene.material import Subsurface
+from ddprt.transport.diffusion import decay_rate, depths
 from ddprt.transport.packets import Geometry
 
 FAR = 3.0
@@ -174,58 +175,25 @@ class Body:
         surface = self.normals, self.corners, np.float32(self.offset)
         grid = self.depth, self.low, np.float32(self.cell), self.bounds, np.float32(self.far)
         constants: tuple[Any, ...] = self.extinction, self.albedo, self.decay, *bends, *surface, *grid
-        hits: tuple[Any, ...] = triangle, u, v, reach, True
-        count, left, lost = _advance(*state, *hits, *constants, 0, *out)
+        given: tuple[Any, ...] = *state, triangle, u, v, reach, True, *constants, 0, *out
+        count, left, lost = _advance(*given)
         rays, turn = 0, 0
         while count and turn < _MOST:
             state = tuple(part[:count] for part in state)
             triangle, u, v, reach = self.geometry.first(state[0], state[1], reach[:count])
             rays, turn = rays + count, turn + 1
-            hits = triangle, u, v, reach, False
-            count, left, gone = _advance(*state, *hits, *constants, left, *out)
+            given = *state, triangle, u, v, reach, False, *constants, left, *out
+            count, left, gone = _advance(*given)
             lost += gone
         flat, weights, which = (part[:left] for part in out)
         at, towards = weights.T.copy(), flat[:, :3].copy()
         return Exits(which[:, 0].copy(), which[:, 1].copy(), at[0], at[1], towards, flat[:, 3:].copy(), rays, lost + count)
 
 
-def decay_rate(albedo: float) -> float:
-    """Diffusion length's inverse in free paths, of a medium that scatters evenly: the root of albedo atanh(k) / k = 1."""
-    if albedo >= 1:
-        return 0.0
-    low, high = 0.0, 1.0
-    for _ in range(60):
-        middle = (low + high) / 2
-        low, high = (middle, high) if albedo * np.arctanh(middle) < middle else (low, middle)
-    return low
-
-
 def weight_of_jump(radius: float, extinction: float, albedo: float) -> float:
     """What is left of light that starts evenly in a medium of even scattering when it first comes so far, metres."""
     x = decay_rate(albedo) * (radius * extinction + EXTRAPOLATED)
     return float(x / np.sinh(x)) if x > 0 else 1.0
-
-
-def depths(
-    corners: Float32[np.ndarray, "triangles 3 3"], low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], cell: float
-) -> tuple[Float32[np.ndarray, "x y z"], float]:
-    """Lower bounds of the distance from the centres of cubic cells to a surface, and the edge of the cells, metres.
-
-    Points are spread over the surface so that none of it is further from one than an edge over the root of three.
-    """
-    from scipy.spatial import cKDTree
-
-    size = np.ceil((high - low) / cell).astype(int) + 1
-    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
-    cuts, spread = np.maximum(np.ceil(longest / cell), 1).astype(int), []
-    for number in np.unique(cuts):
-        i, j = np.mgrid[: number + 1, : number + 1]
-        weights = np.stack([i, j, number - i - j], -1)[i + j <= number] / number
-        spread.append(np.einsum("kc,tcd->tkd", weights, corners[cuts == number]).reshape(-1, 3))
-    centres = np.stack(np.meshgrid(*(np.arange(count) + 0.5 for count in size), indexing="ij"), -1) * cell + low
-    distance, _ = cKDTree(np.concatenate(spread)).query(centres.reshape(-1, 3), workers=-1)
-    step = float((longest / cuts).max()) / 3**0.5
-    return np.maximum(distance - step, 0).reshape(size).astype(np.float32), cell
 
 
 def sample_henyey(u: Float64[np.ndarray, " n"], anisotropy: float) -> Float64[np.ndarray, " n"]:

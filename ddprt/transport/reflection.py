@@ -63,7 +63,8 @@ class Reflection:
         """The same on coarse blocks; light goes through bodies between senders, since it may not get far."""
         sent = self.coarse * light
         if self.passage:
-            assert self.home is not None and self.share is not None
+            assert self.home is not None
+            assert self.share is not None
             passed = self.leaving * self.passage.of((finer[self.bodies] @ light).astype(np.float32))
             np.add.at(sent, self.home, self.share[:, None] * passed)
         return sent
