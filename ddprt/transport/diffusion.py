@@ -9,7 +9,7 @@ def decay_rate(albedo: float) -> float:
     """Diffusion length's inverse in free paths, of a medium that scatters evenly: the root of albedo atanh(k) / k = 1."""
     if albedo >= 1:
         return 0.0
-    low, high = 0.0, 1.0
+    low, high = 0.0, 1 - 1e-15  # where it is 1 to rounding, the function is infinite
     for _ in range(60):
         middle = (low + high) / 2
         low, high = (middle, high) if albedo * np.arctanh(middle) < middle else (low, middle)
