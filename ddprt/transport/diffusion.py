@@ -4,6 +4,8 @@ import numpy as np
 
 from ddprt.axes import Float, Float32
 
+_POINTS = 1 << 20  # spread at a time
+
 
 def decay_rate(albedo: float) -> float:
     """Diffusion length's inverse in free paths, of a medium that scatters evenly: the root of albedo atanh(k) / k = 1."""
@@ -21,18 +23,21 @@ def depths(
 ) -> tuple[Float32[np.ndarray, "x y z"], float]:
     """Lower bounds of the distance from the centres of cubic cells to a surface, and the edge of the cells, metres.
 
-    Points are spread over the surface so that none of it is further from one than an edge over the root of three.
+    Points are spread over the surface so that none of it is further from one than half an edge over the root of three; cells
+    that hold one count as the surface, wherever in them it is.
     """
-    from scipy.spatial import cKDTree
+    from scipy.ndimage import distance_transform_edt
 
     size = np.ceil((high - low) / cell).astype(int) + 1
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(1)
-    cuts, spread = np.maximum(np.ceil(longest / cell), 1).astype(int), []
+    cuts, clear = np.maximum(np.ceil(2 * longest / cell), 1).astype(int), np.ones(size, bool)
     for number in np.unique(cuts):
         i, j = np.mgrid[: number + 1, : number + 1]
         weights = np.stack([i, j, number - i - j], -1)[i + j <= number] / number
-        spread.append(np.einsum("kc,tcd->tkd", weights, corners[cuts == number]).reshape(-1, 3))
-    centres = np.stack(np.meshgrid(*(np.arange(count) + 0.5 for count in size), indexing="ij"), -1) * cell + low
-    distance, _ = cKDTree(np.concatenate(spread)).query(centres.reshape(-1, 3), workers=-1)
-    step = float((longest / cuts).max()) / 3**0.5
-    return np.maximum(distance - step, 0).reshape(size).astype(np.float32), cell
+        own, step = np.flatnonzero(cuts == number), max(1, _POINTS // len(weights))
+        for first in range(0, len(own), step):
+            spread = np.einsum("kc,tcd->tkd", weights, corners[own[first : first + step]]).reshape(-1, 3)
+            clear[tuple(np.clip(((spread - low) / cell).astype(int), 0, size - 1).T)] = False
+    distance = cell * distance_transform_edt(clear)
+    slack = cell * (3**0.5 / 2 + 0.5 / 3**0.5)
+    return np.maximum(distance - slack, 0).astype(np.float32), cell
