@@ -74,6 +74,13 @@ class Subsurface:
     anisotropy: float = 0.0
     index: float = 1.0
 
+    @staticmethod
+    def single_albedo(thick: float, anisotropy: float) -> float:
+        """The albedo of single scattering of an unbounded medium that sends back so much (`thick_albedo`, index 1)."""
+        b = 1.139 + 1.17 * thick
+        similar = (b - (b * b - 0.556 * (1 - thick)) ** 0.5) / 0.278
+        return min(max((1 - similar**2) / (1 - anisotropy * similar**2), 0.0), 1.0)
+
     @property
     def thick_albedo(self) -> tuple[float, float, float]:
         """What a thick body sends back of light from everywhere, as an opaque surface would: within 0.01 of exact.

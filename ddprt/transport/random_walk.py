@@ -121,8 +121,7 @@ class Body:
         similar = extinction * (1 - medium.anisotropy * albedo)
         even = (1 - medium.anisotropy) * albedo / (1 - medium.anisotropy * albedo)
         decay = similar * np.array([decay_rate(share) for share in even])
-        g = abs(medium.anisotropy)
-        switch = 0 if g == 0 else int(np.ceil(np.log(_FORGOTTEN) / np.log(g)))
+        switch = int(np.ceil(np.log(_FORGOTTEN) / np.log(max(abs(medium.anisotropy), 1e-9))))
         low, high = corners.min((0, 1)), corners.max((0, 1))
         far = FAR / float(similar.min()) if jumps and even.min() >= WHITE else np.inf
         finest = max(float((high - low).max()) / _CELLS, 0.5 / float(similar.max()))
@@ -203,8 +202,7 @@ def sample_henyey(u: Float64[np.ndarray, " n"], anisotropy: float) -> Float64[np
 
 def pdf_henyey(cosine: Float[np.ndarray, " n"], anisotropy: float) -> Float[np.ndarray, " n"]:
     """Per steradian. Reference: Henyey and Greenstein, "Diffuse Radiation in the Galaxy", 1941."""
-    g = anisotropy
-    return (1 - g * g) / (4 * np.pi * (1 + g * g - 2 * g * cosine) ** 1.5)
+    return (1 - anisotropy**2) / (4 * np.pi * (1 + anisotropy**2 - 2 * anisotropy * cosine) ** 1.5)
 
 
 def invert_henyey(cosine: Float[np.ndarray, " n"], anisotropy: float) -> Float[np.ndarray, " n"]:
