@@ -725,7 +725,7 @@ def test_volumes_that_scatter_are_media(tmp_path: Path) -> None:
     assert (medium.anisotropy, medium.index) == (0.4, 1.3)
     np.testing.assert_allclose(replace(medium, index=1.0).thick_albedo, [0.9, 0.6, 0.2], atol=1e-9)
     assert scene.materials[0].gloss is None
-    assert scene.notes == ()
+    assert scene.notes == ("12 missing shading normals made from the faces",)
     for left_out in ("volume", "volume_scatter", "transmission"):
         parts = {"volume": volume, "volume_scatter": scatter, **through}
         del parts[left_out]
