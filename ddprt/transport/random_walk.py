@@ -40,7 +40,7 @@ EXTRAPOLATED = 0.7104
 
 _FORGOTTEN = 0.05
 _FAINT = 0.5  # of a sum of three weights
-_CELLS = 96  # of the grid of depths, along the body's longest side, at most
+_CELLS = 160  # of the grid of depths, along the body's longest side, at most
 _MOST = 200_000  # rays of a walk; only a white body in which light is caught reaches them
 
 

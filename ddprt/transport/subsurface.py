@@ -99,13 +99,20 @@ class Inside:
         """Of refraction, of all bodies."""
         return {body.index for body, _ in self.bodies}
 
+    @cached_property
+    def largest(self) -> float:
+        """Share of light from everywhere that enters the body that takes most."""
+        return max(map(mean_entering, self.indices), default=0.0)
+
     def matrix(self, *, seed: int, stream: str) -> "Passage":
         """R among the senders on bodies."""
         receivers = self.receivers(_SENDER_WALKS, seed, f"{stream} inside senders")
         parts = list(self._rows(receivers, seed, f"{stream} inside senders"))
         from scipy.sparse import vstack
 
-        return Passage(tuple(vstack([part[channel] for part in parts], format="csr") for channel in range(3)), self.senders)
+        return Passage(
+            tuple(vstack([part[channel] for part in parts], format="csr") for channel in range(3)), self.senders, self.largest
+        )
 
     def leave(
         self,
@@ -131,7 +138,10 @@ class Inside:
         first = 0
         for rows in self._rows(receivers, seed, f"{stream} inside"):
             count = rows[0].shape[0]
-            yield wanted[first : first + count], Passage(rows, self.senders).of(arrived).reshape(count, -1, 3).swapaxes(0, 1)
+            yield (
+                wanted[first : first + count],
+                Passage(rows, self.senders, self.largest).of(arrived).reshape(count, -1, 3).swapaxes(0, 1),
+            )
             first += count
 
     def choose(
@@ -228,15 +238,12 @@ class Passage:
     Attributes:
       channels: sparse, from senders on bodies to receivers.
       senders: those on bodies.
+      largest: share of light from everywhere that a body sends out, at most: what enters. Sums of rows vary about less.
     """
 
     channels: tuple[Matrix, ...]
     senders: Int[np.ndarray, " senders"]
-
-    @cached_property
-    def largest(self) -> float:
-        """Largest sum of a row: of the light that falls on a body from everywhere, what leaves at its brightest place."""
-        return max((float(rows.sum(1).max()) for rows in self.channels if rows.shape[0]), default=0.0)
+    largest: float
 
     def of(self, light: Float32[np.ndarray, "senders columns"]) -> Float32[np.ndarray, "receivers columns"]:
         """What leaves of light that arrives."""
