@@ -4,17 +4,19 @@ Enters: scaled and encoded pairs. Leaves: a Relighter. Files, scenes and metrics
 """
 
 from collections.abc import Mapping
-from importlib.metadata import entry_points
 from typing import Any
 
 from pydantic import ValidationError
 
 from ddprt.catalogue import Catalogue
 from ddprt.errors import UserError, nearest
+from ddprt.methods import packages
 from ddprt.methods.autoencoder import Autoencoder
 from ddprt.methods.floors import MeanLightmap, NearestLighting
 from ddprt.methods.method import Method
 from ddprt.methods.mlp import Mlp
+from ddprt.methods.neural_lightmap import NeuralMap
+from ddprt.methods.nonnegative import Nonnegative
 from ddprt.methods.residual import Residual
 from ddprt.methods.sh_prt import ShPrt
 from ddprt.methods.svd_ridge import SvdRidge
@@ -28,10 +30,18 @@ METHODS: Catalogue[type[Method]] = Catalogue(
         "mlp": Mlp,
         "autoencoder": Autoencoder,
         "residual": Residual,
+        "nonnegative": Nonnegative,
+        "neural-lightmap": NeuralMap,
         "sh-prt": ShPrt,
     },
 )
-METHODS.update({point.name: point.load() for point in entry_points(group="ddprt.methods")})
+packages.register(METHODS)
+
+
+def known_methods() -> tuple[str, ...]:
+    """Names of all entries, those of packages that were still being imported when `METHODS` was made among them."""
+    packages.register_postponed(METHODS)
+    return tuple(METHODS)
 
 
 def make_method(name: str, shared: Mapping[str, Any], own: Mapping[str, Any]) -> Method:
@@ -42,8 +52,10 @@ def make_method(name: str, shared: Mapping[str, Any], own: Mapping[str, Any]) ->
       shared: settings of the [fit] section; each method takes those it knows.
       own: the method's own settings, all of which it must know.
     Raises:
-      UserError: unknown method or setting, wrong type or range.
+      UserError: unknown method or setting, wrong type or range, or a method of another package that had to be left out.
     """
+    if name not in known_methods() and name in packages.REFUSED:
+        raise UserError(packages.REFUSED[name])
     method = METHODS[name]
     known = method.model_fields
     for setting in own:
@@ -60,4 +72,4 @@ def make_method(name: str, shared: Mapping[str, Any], own: Mapping[str, Any]) ->
         raise UserError(f"methods.settings.{name}.{place}: got {fault['input']!r}, expected: {fault['msg']}") from None
 
 
-__all__ = ["METHODS", "Method", "make_method"]
+__all__ = ["METHODS", "Method", "known_methods", "make_method"]

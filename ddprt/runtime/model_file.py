@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from ddprt import __version__
+from ddprt.catalogue import Catalogue
 from ddprt.dataset.layers import Layer
 from ddprt.errors import UserError
 from ddprt.files import read_tensors, sha256, write_tensors, write_text
@@ -234,7 +235,7 @@ def _assemble(
         document["scene"],
         uv,
         None if checked.trust is None else _yardstick(checked.trust, tensors),
-        {entry.name: _layer_model(entry, tensors, parts[entry.name]) for entry in checked.layers},
+        Catalogue("layer", {entry.name: _layer_model(entry, tensors, parts[entry.name]) for entry in checked.layers}),
         Holes.read(tensors, len(tensors["scene.corners"])),
         constant,
     )
