@@ -44,6 +44,17 @@ def known_methods() -> tuple[str, ...]:
     return tuple(METHODS)
 
 
+def method_named(name: str) -> type[Method]:
+    """An entry of `METHODS`.
+
+    Raises:
+      UserError: there is none, or it is of another package that had to be left out.
+    """
+    if name not in known_methods() and name in packages.REFUSED:
+        raise UserError(packages.REFUSED[name])
+    return METHODS[name]
+
+
 def make_method(name: str, shared: Mapping[str, Any], own: Mapping[str, Any]) -> Method:
     """A method with its settings.
 
@@ -54,9 +65,7 @@ def make_method(name: str, shared: Mapping[str, Any], own: Mapping[str, Any]) ->
     Raises:
       UserError: unknown method or setting, wrong type or range, or a method of another package that had to be left out.
     """
-    if name not in known_methods() and name in packages.REFUSED:
-        raise UserError(packages.REFUSED[name])
-    method = METHODS[name]
+    method = method_named(name)
     known = method.model_fields
     for setting in own:
         if setting not in known:
@@ -72,4 +81,4 @@ def make_method(name: str, shared: Mapping[str, Any], own: Mapping[str, Any]) ->
         raise UserError(f"methods.settings.{name}.{place}: got {fault['input']!r}, expected: {fault['msg']}") from None
 
 
-__all__ = ["METHODS", "Method", "known_methods", "make_method"]
+__all__ = ["METHODS", "Method", "known_methods", "make_method", "method_named"]

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from pydantic import Field
 
 from ddprt.fitting.basis import entry_weights, fit_basis
-from ddprt.methods.learned import Layers, Learned, Seen, dense_layers, losses, statuses
+from ddprt.methods.learned import Layers, Learned, Seen, dense_layers, told
 from ddprt.methods.method import Examples, FitReport, Frame, array_bytes, as_pytree, columns, grouped, in_memory
 from ddprt.methods.svd_ridge import LinearTransfer, transfer_to
 
@@ -143,8 +143,8 @@ class NeuralMap(Learned):
         train, validation = (replace(part, indirect=in_memory(part.indirect)) for part in (train, validation))
         entries = jnp.asarray(entry_weights(train.area, train.weights, train.channels))  # type: ignore[arg-type]
         turned = self.light == "everywhere"
-        told = self.coefficients or self.bases * (1 if turned else 2)
-        basis = fit_basis(columns(train)[0], entries, bases=max(self.bases, told))
+        count = self.coefficients or self.bases * (1 if turned else 2)
+        basis = fit_basis(columns(train)[0], entries, bases=max(self.bases, count))
         linear = transfer_to(basis, train, self.ridge)
         groups, bases, _ = linear.matrix.shape
         out, kept = 3 // groups, min(self.bases, bases)
@@ -169,7 +169,7 @@ class NeuralMap(Learned):
         silent = trained.parameters._replace(features=start, head=jnp.zeros_like(trained.parameters.head))
         better = _check(problem, trained.parameters, held) < _check(problem, silent, held)
         chosen: Decoder = trained.parameters if better else silent
-        report = replace(linear.report, bases=kept, loss=losses(trained)).noting(*statuses(trained))
+        report = told(replace(linear.report, bases=kept), trained)
         weights, biases = zip(*chosen.layers, strict=True)
         maps = jnp.moveaxis(chosen.features, 2, 0).reshape(kept, -1)
         matrix = matrix / spread[:, None, None]
