@@ -13,6 +13,7 @@ from ddprt.catalogue import Catalogue
 from ddprt.errors import UserError, nearest
 from ddprt.methods.autoencoder import Autoencoder
 from ddprt.methods.floors import MeanLightmap, NearestLighting
+from ddprt.methods.light_network import LightNetworks
 from ddprt.methods.method import Method
 from ddprt.methods.mlp import Mlp
 from ddprt.methods.residual import Residual
@@ -29,6 +30,7 @@ METHODS: Catalogue[type[Method]] = Catalogue(
         "autoencoder": Autoencoder,
         "residual": Residual,
         "sh-prt": ShPrt,
+        "light-network": LightNetworks,
     },
 )
 METHODS.update({point.name: point.load() for point in entry_points(group="ddprt.methods")})
