@@ -20,6 +20,8 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "mlp": {"steps": 300, "width": 32},
     "residual": {"steps": 300, "width": 32},
     "sh-prt": {"order": 1, "space": "linear"},
+    "light-network": {"features": 16, "length": 1.0, "steps": 100, "space": "linear"},
+    "point-set": {"steps": 100, "width": 16},
 }
 
 

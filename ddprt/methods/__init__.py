@@ -16,6 +16,7 @@ from ddprt.methods.floors import MeanLightmap, NearestLighting
 from ddprt.methods.light_network import LightNetworks
 from ddprt.methods.method import Method
 from ddprt.methods.mlp import Mlp
+from ddprt.methods.point_set import PointSet
 from ddprt.methods.residual import Residual
 from ddprt.methods.sh_prt import ShPrt
 from ddprt.methods.svd_ridge import SvdRidge
@@ -31,6 +32,7 @@ METHODS: Catalogue[type[Method]] = Catalogue(
         "residual": Residual,
         "sh-prt": ShPrt,
         "light-network": LightNetworks,
+        "point-set": PointSet,
     },
 )
 METHODS.update({point.name: point.load() for point in entry_points(group="ddprt.methods")})

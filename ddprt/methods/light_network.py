@@ -198,7 +198,8 @@ class Lit(NamedTuple):
     def of(cls, examples: Examples, basis: Basis, entries: Array, around: Surroundings) -> "Lit":
         """Lightings that some point sees; the rest have size and targets 0."""
         groups = 3 if examples.channels == "mono" else 1
-        lobes = [[lobe for light in lights for lobe in around.lobes(light)] for lights in examples.frame.lightings or ()]
+        given = examples.frame.lightings or ((),) * len(examples.scale)
+        lobes = [[lobe for light in lights for lobe in around.lobes(light)] for lights in given]
         count = max(map(len, lobes), default=0) or 1
         told, strength = np.zeros((len(lobes), count, _TOLD)), np.zeros((len(lobes), count, 3))
         for row, each in enumerate(lobes):
@@ -330,8 +331,6 @@ def _solved(lit: Lit, B: np.ndarray, b: np.ndarray, ridge: float | str) -> tuple
     remarks = {name for one in solved for name in one.remarks if name != "rank_deficient"}  # lamps fill few features, always
     report = FitReport(
         bases=lit.targets.shape[2],
-        condition=tuple(one.condition for one in solved),
-        ranks=tuple(one.rank for one in solved),
         ridge=tuple(one.ridge for one in solved) or (0.0,),
         ridge_chosen_by="loo" if ridge == "auto" else "given",
         ridge_second=(choice.second,) * len(solved) if choice else (),
