@@ -1,6 +1,5 @@
 """The encoder over a set of points: any order, any number, and svd-ridge where all are there."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -49,8 +48,9 @@ def fitted(parts: tuple[Examples, Examples, Examples]) -> SetEncoder:
 @pytest.fixture(scope="module")
 def bent() -> tuple[SetEncoder, Examples]:
     """One whose network has something to say."""
-    train, held, test = examples(1, 200, bend=0.5), examples(2, 60, bend=0.5), examples(3, 60, bend=0.5)
-    return PointSet(**{**SETTINGS, "bases": 12, "steps": 400, "learning_rate": 2e-3}).fit(train, held, key=KEY), test
+    train, held, test = (examples(seed, count, bend=0.5) for seed, count in ((1, 400), (2, 100), (3, 100)))
+    settings = {**SETTINGS, "bases": 12, "steps": 300, "learning_rate": 2e-3, "width": 64, "keep": 0.9}
+    return PointSet(**settings).fit(train, held, key=KEY), test
 
 
 def some(part: Examples, which: np.ndarray) -> Examples:
@@ -74,13 +74,12 @@ def test_all_points_and_no_network_are_the_ridge(fitted: SetEncoder, parts: tupl
 @pytest.mark.parametrize("count", [24, 12, 5])
 def test_the_order_of_points_does_not_matter(count: int, bent: tuple[SetEncoder, Examples]) -> None:
     encoder, test = bent
-    assert (encoder.gates > 0).all(), "else the network would not be tested"
+    encoder = replace(encoder, gates=jnp.ones(2))  # so that the network is tested, too
     rng = np.random.default_rng(count)
     which = rng.permutation(24)[:count]
     one, other = (encoder.predict(some(test, order).frame) for order in (which, rng.permutation(which)))
-    # The system is solved in float32, with a condition of at most 1 / noise; that in turn is at least 1e-7, and where it
-    # counts the light is what is read well. Rounding of the sums by 24 u32, times 100 for directions that noise damps to 1 %.
-    np.testing.assert_allclose(one, other, atol=100 * 24 * U32 * float(jnp.abs(one).max()), rtol=0)
+    # The stacked problem has a condition of at most the root of largest square over noise, (1 / 1e-6)^0.5; sums are of 24.
+    np.testing.assert_allclose(one, other, atol=1e3 * 24 * U32 * float(jnp.abs(one).max()), rtol=0)
 
 
 def test_half_of_the_points_tell_all_where_they_can(fitted: SetEncoder, parts: tuple[Examples, Examples, Examples]) -> None:
@@ -99,7 +98,7 @@ def test_half_of_the_points_tell_all_where_they_can(fitted: SetEncoder, parts: t
 def test_points_nearby_stand_in(fitted: SetEncoder, parts: tuple[Examples, Examples, Examples]) -> None:
     """A hundredth of the room beside a trained point, another answers as that one does: weights fall with d^-4."""
     test = parts[2]
-    moved = replace(test, frame=replace(test.frame, positions=test.frame.positions + 1e-4))
+    moved = replace(test, frame=replace(test.frame, positions=test.frame.positions + 0.01))
     there, beside = (fitted.predict(part.frame) for part in (some(test, np.arange(12)), some(moved, np.arange(12))))
     np.testing.assert_allclose(beside, there, atol=1e-3 * float(jnp.abs(there).max()), rtol=0)
 
@@ -111,10 +110,10 @@ def test_a_network_that_is_worth_something_is_taken(bent: tuple[SetEncoder, Exam
 
 
 @pytest.fixture(scope="module")
-def models() -> Iterator[dict[str, Model]]:
+def models() -> dict[str, Model]:
     data = make_data(*room())
     settings = {"steps": 20, "check_every": 10, "width": 8}
-    yield {"point-set": ddprt.fit(data, "point-set", bases=4, settings=settings), "svd-ridge": ddprt.fit(data, bases=4)}
+    return {"point-set": ddprt.fit(data, "point-set", bases=4, settings=settings), "svd-ridge": ddprt.fit(data, bases=4)}
 
 
 @pytest.mark.parametrize("space", ["linear", "gamma"])

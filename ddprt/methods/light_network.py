@@ -8,7 +8,7 @@ number of lights, and non-linear in where they are. Measurements only set the sc
 Frequencies start as draws from a normal distribution of one over `length`, which makes the layer a Gaussian process in all but
 name (Rahimi and Recht, "Random Features for Large-Scale Kernel Machines", NIPS 2007; Tancik et al., "Fourier Features Let
 Networks Learn High Frequency Functions in Low Dimensional Domains", NeurIPS 2020). A is the ridge solution of these, length and
-ridge by leaving one lighting out; then all of A, B and b are trained from there, and kept where validation lightings gain by it.
+ridge by leaving one lighting out; then A, B and b are trained from there, and kept where validation lightings gain by it.
 
 Areas are told by their centre, their mean direction and their reach; a sky is the sum of directional lights that its harmonics
 up to `SKY` make, so a method that was trained under suns answers for it.
@@ -118,7 +118,7 @@ _LAMPS: dict[str, Any] = {
     "sphere": lambda light: (np.multiply(light.radiance, np.pi * light.radius**2), _NOWHERE, _ROUND, 0.0),
     "mesh": _mesh,
 }
-"""Of what has a place: intensity at its strongest, W/sr; mean direction; cosines of its cone; whether it shines as a surface."""
+"""Of what has a place: intensity at its strongest, W/sr; mean direction; cosines of its cone; whether it is a surface."""
 
 
 class Cosines(NamedTuple):
@@ -178,21 +178,21 @@ class LightNetwork:
 
 
 class Lit(NamedTuple):
-    """Lightings as lobes and the coefficients that they bring, both over the size of the strengths.
+    """Lightings as lobes and the coefficients that they bring, both over the size of the strengths: float64, then float32.
 
     Attributes:
-      told: numbers of each lobe; lightings with fewer than others have lobes of no strength.
-      strength: over `size`.
-      targets: coefficients over `size` and `spread`.
-      importance: of each lighting and group, mean 1: its share in squared errors of light.
-      size: norm of the strengths of each group, 0 where nothing is known of the light.
+      told: (lightings, lobes, numbers); lightings with fewer lobes than others have some of no strength.
+      strength: (lightings, lobes, 3), over `size`.
+      targets: (lightings, groups, bases), coefficients over `size`.
+      importance: (lightings, groups), mean 1: its share in squared errors of light.
+      size: (lightings, groups), norm of the strengths, 0 where nothing is known of the light.
     """
 
-    told: Float[Array, "lightings lobes told"]
-    strength: Float[Array, "lightings lobes 3"]
-    targets: Float[Array, "lightings groups bases"]
-    importance: Float[Array, "lightings groups"]
-    size: Float64[np.ndarray, "lightings groups"]
+    told: Any
+    strength: Any
+    targets: Any
+    importance: Any
+    size: Any
 
     @classmethod
     def of(cls, examples: Examples, basis: Basis, entries: Array, around: Surroundings) -> "Lit":

@@ -4,14 +4,14 @@ Points are told by value, position and normal. Features f(p) of a point do not d
 of f f^T are all that is known of a set, and neither an order nor a number of points is in them. What follows is not linear in
 these sums (Zaheer et al., "Deep Sets", NeurIPS 2017):
 
-    c = (sum f f^T + noise)^-1 sum f z,    u = M F c + gate * network(c).
+    c = (sum f f^T + noise)^-1 sum f z,    u = M F c + gate * network(size of F's columns * c).
 
 F holds the features of the trained points, as training tells which values occur together, z ~ F c with c of unit variance. So c
 is the conditional mean of a Gaussian whose covariance is that of the training light, and F c what all trained points would have
 measured ("gappy POD": Everson and Sirovich, JOSA A 1995). A ridge transfer M takes it from there; where every trained point is
 there it takes their own values, and is svd-ridge. A point that is none of the trained ones gets its features from these by
-attention, with weights d^-4 of a distance d that counts place and facing (Shepard, "A two-dimensional interpolation function for
-irregularly-spaced data", 1968).
+attention, with weights d^-4 of a distance d that counts place and facing (Shepard, "A two-dimensional interpolation function
+for irregularly-spaced data", 1968).
 
 The network learns, with points dropped at random, what transfers miss that have not seen the lighting in question. How much of
 it is taken is decided on validation lightings, once for all points and once for fewer; it is none where it makes them worse.
@@ -36,7 +36,7 @@ _FOLDS = 8  # transfers that have each not seen one part of the lightings
 _MASKS = 32  # sets of points that training goes through, beside all points
 _CHECKED = 8  # of them, those that validation lightings are looked at with
 _SAME = 1e-12  # squared distance that counts as none: next to it a point at distance 1 weighs nothing in float32
-_NOISES = tuple(10.0**power for power in range(-7, 0))  # tried, in units of the mean square norm of measurements
+_NOISES = tuple(10.0**power for power in range(-6, 0))  # tried, in units of the mean square norm of measurements
 
 
 def squared_distances(
@@ -57,9 +57,7 @@ def attention(squares: Float[Array, "asking there"]) -> Float[Array, "asking the
     return jax.nn.softmax(-2 * jnp.log(jnp.maximum(squares, _SAME)), -1)
 
 
-def reader(
-    at: Float[Array, "points colours latent"], noise: Float[Array, ""] | float
-) -> Float[Array, "latent points colours"]:
+def reader(at: Float[Array, "points colours latent"], noise: Float[Array, ""] | float) -> Float[Array, "latent points colours"]:
     """From values at points to c.
 
     Args:
@@ -67,15 +65,21 @@ def reader(
       noise: variance of a value.
     """
     f = at.reshape(-1, at.shape[2])
-    inner = jnp.matmul(f.T, f, precision="highest") + noise * jnp.eye(f.shape[1])
-    return jax.scipy.linalg.solve(inner, f.T, assume_a="pos").reshape(-1, *at.shape[:2])
+    # By QR of the stacked problem: the sums of squares would have the square of its condition, too much for float32.
+    Q, R = jnp.linalg.qr(jnp.concatenate([f, jnp.sqrt(noise) * jnp.eye(f.shape[1])]))
+    return jax.scipy.linalg.solve_triangular(R, Q[: len(f)].T).reshape(-1, *at.shape[:2])
 
 
-def corrected(layers: Layers, c: Float[Array, "frames groups latent"]) -> Float[Array, "frames groups bases"]:
+def strength(features: Float[Array, "points colours latent"]) -> Float[Array, " latent"]:
+    """Size of F's columns: how much light each entry of c stands for, without which a network would heed what is rare."""
+    return jnp.sqrt(jnp.sum(features**2, (0, 1)))
+
+
+def corrected(layers: Layers, read: Float[Array, "frames groups latent"]) -> Float[Array, "frames groups bases"]:
     """What the network adds; twice the values add twice as much."""
-    square = jnp.sum(c**2, -1, keepdims=True)
+    square = jnp.sum(read**2, -1, keepdims=True)
     size = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
-    return forward(layers, c / jnp.where(size > 0, size, 1)).astype(jnp.float32) * size
+    return forward(layers, read / jnp.where(size > 0, size, 1)).astype(jnp.float32) * size
 
 
 @as_pytree
@@ -111,7 +115,7 @@ class SetEncoder:
         gate = jnp.where(whole, self.gates[0], self.gates[1])
         c = jnp.einsum("rpc,fgpc->fgr", read, values, precision="highest")
         # Where the gate is shut, even a network that has gone wrong adds nothing.
-        added = corrected(tuple(zip(self.weights, self.biases, strict=True)), c) * self.spread
+        added = corrected(tuple(zip(self.weights, self.biases, strict=True)), c * strength(F)) * self.spread
         light = compose(u + jnp.where(gate > 0, gate * added, 0), self.basis, jnp.zeros(self.basis.shape[1]))
         return light if groups == 3 else light.reshape(len(light), -1, 3)
 
@@ -132,7 +136,7 @@ class Sets(NamedTuple):
     """Sets of points, all of them first: what is read from each, and what the transfer misses.
 
     Attributes:
-      read: c over its norm.
+      read: c times the size of F's columns, over the norm of that.
       left: true coefficients less those of the transfer, over that norm and `size`.
       importance: of each, as in `Seen`.
       size: what coefficients were divided by.
@@ -207,8 +211,8 @@ class PointSet(Learned):
         at, points = (train.frame.positions, train.frame.normals), len(train.frame.positions)
         if bases == 0:
             layers = (jnp.zeros((groups + 1, 0)),), (jnp.zeros(0),)
-            nothing = jnp.zeros((points, inputs // points, 1)), jnp.ones(()), *layers, jnp.zeros(0), jnp.zeros(2)
-            return SetEncoder(whole.matrix, whole.basis, *at, *nothing, whole.report)
+            blind = jnp.zeros((points, inputs // points, 1)), jnp.ones(())
+            return SetEncoder(whole.matrix, whole.basis, *at, *blind, *layers, jnp.zeros(0), jnp.zeros(2), whole.report)
         draw, step = jax.random.split(key)
         masks = _drawn(draw, points, self.keep)
         few = masks[:: _MASKS // _CHECKED]
@@ -226,8 +230,8 @@ class PointSet(Learned):
         trained = self.trained("point-set", SomePoints(network), sets, known, step)
         report = replace(whole.report, loss=losses(trained)).noting(*statuses(trained))
         weights, biases = zip(*trained.parameters, strict=True)
-        rest = jnp.float32(_NOISES[best]), weights, biases, size, _worth(trained.parameters, known)
-        return SetEncoder(whole.matrix, whole.basis, *at, own, *rest, report)
+        noise, gates = jnp.float32(_NOISES[best]), _worth(trained.parameters, known)
+        return SetEncoder(whole.matrix, whole.basis, *at, own, noise, weights, biases, size, gates, report)
 
 
 def _drawn(key: Array, points: int, keep: float) -> Bool[Array, "masks points"]:
@@ -265,14 +269,15 @@ def _sets(
             c = jnp.einsum("ri,ngi->ngr", read, seen.inputs, precision="highest")
             there = jnp.einsum("ir,ngr->ngi", F.reshape(-1, F.shape[2]), c, precision="highest")
             z = jnp.where(jnp.all(mask), seen.inputs, there)
-            return c, jnp.einsum("gbi,ngi->ngb", matrix, z, precision="highest")
+            return c * strength(F), jnp.einsum("gbi,ngi->ngb", matrix, z, precision="highest")
 
         c, found = (jnp.take_along_axis(each, fold, 0)[0] for each in jax.vmap(one)(features, matrices))
         size = jnp.sqrt(jnp.sum(c**2, -1, keepdims=True))
         over = jnp.where(size > 0, size, 1)
         return c / over, jnp.where(size > 0, (seen.targets - found) / over, 0), seen.importance * size[..., 0] ** 2
 
-    return Sets(*jax.lax.map(by, masks), jnp.ones(seen.targets.shape[2]))
+    read, left, importance = jax.lax.map(by, masks)
+    return Sets(read, left, importance, jnp.ones(seen.targets.shape[2]))
 
 
 def _worst(sets: Sets) -> float:

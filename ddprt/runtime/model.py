@@ -80,7 +80,7 @@ class Model:
         Args:
           values: (points, 3) or (frames, points, 3) measured light in W/m², of `quantity`.
           lightings: what was measured: a lighting, or one for each frame. Only methods that answer from lights look at it.
-          points: which of the model's points `values` are of, in their order, where they are not all; for methods that take any.
+          points: which of the model's points `values` are of, in that order, where not all of them; for methods that take any.
           clamp: cut negative light off, as an engine does; "energy": in the way that keeps the total of each frame and channel
             (see `ddprt.fitting.encoding.without_negatives`); False keeps it.
           fade: where trust is low, go over to the mean lightmap, as bright as the measurements are.
@@ -205,14 +205,14 @@ class Model:
         """
         if not isinstance(self.relighter, TakesAnyPoints):
             raise UserError(
-                f"points: got some of them, but {self.method} answers from all {self.points} alone; leave it out, or fit point-set"
+                f"points: got some of them, but {self.method} answers from all {self.points}; leave it out, or fit point-set"
             )
         chosen = np.asarray(points)
         fine = chosen.ndim == 1 and len(chosen) > 0 and np.issubdtype(chosen.dtype, np.integer)
         if not fine or chosen.min() < 0 or chosen.max() >= self.points or len(np.unique(chosen)) < len(chosen):
             raise UserError(
-                f"points: got {' '.join(repr(points).split())[:60]}, expected different whole numbers from 0 to {self.points - 1}; "
-                "name each measured point once"
+                f"points: got {' '.join(repr(points).split())[:60]}, expected different whole numbers from 0 to "
+                f"{self.points - 1}; name each measured point once"
             )
         return chosen
 
