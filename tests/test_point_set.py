@@ -13,13 +13,14 @@ from test_learned import error, examples
 
 import ddprt
 from ddprt.errors import UserError
-from ddprt.methods.method import Examples
+from ddprt.methods.method import Examples, Frame
 from ddprt.methods.point_set import PointSet, SetEncoder
 from ddprt.methods.svd_ridge import SvdRidge
 from ddprt.runtime.model import Model
 
 KEY = jax.random.key(0)
 SETTINGS: dict[str, Any] = {"bases": 8, "latent": 24, "width": 16, "steps": 60, "check_every": 20}
+QUICK = {"steps": 20, "check_every": 10, "width": 8}
 
 
 @pytest.fixture(scope="module")
@@ -57,8 +58,7 @@ def some(part: Examples, which: np.ndarray) -> Examples:
     """The same lightings seen by some of the points, scaled by what these see."""
     seen = part.frame.values[:, which]
     own = jnp.linalg.norm(seen, axis=1)
-    frame = replace(part.frame, values=seen / own[:, None], positions=part.frame.positions[which])
-    frame = replace(frame, normals=part.frame.normals[which])
+    frame = Frame(seen / own[:, None], part.frame.positions[which], part.frame.normals[which])
     return replace(part, frame=frame, indirect=part.indirect / own[:, None], scale=part.scale * own)
 
 
@@ -112,8 +112,7 @@ def test_a_network_that_is_worth_something_is_taken(bent: tuple[SetEncoder, Exam
 @pytest.fixture(scope="module")
 def models() -> dict[str, Model]:
     data = make_data(*room())
-    settings = {"steps": 20, "check_every": 10, "width": 8}
-    return {"point-set": ddprt.fit(data, "point-set", bases=4, settings=settings), "svd-ridge": ddprt.fit(data, bases=4)}
+    return {"point-set": ddprt.fit(data, "point-set", bases=4, settings=QUICK), "svd-ridge": ddprt.fit(data, bases=4)}
 
 
 @pytest.mark.parametrize("space", ["linear", "gamma"])
@@ -121,7 +120,7 @@ def test_a_model_takes_some_of_its_points(space: str, models: dict[str, Model]) 
     values = room()[0][0]
     model = models["point-set"]
     if space == "gamma":
-        model = ddprt.fit(make_data(*room()), "point-set", bases=4, space="gamma", settings={"steps": 20, "check_every": 10})
+        model = ddprt.fit(make_data(*room()), "point-set", bases=4, space="gamma", settings=QUICK)
     order = np.random.default_rng(0).permutation(POINTS)
     whole = model.predict(values)
     shuffled = model.predict(values[order], points=order)

@@ -221,11 +221,12 @@ class PointSet(Learned):
         parts = [np.flatnonzero(fold != number) if len(fold) > 1 else np.arange(1) for number in range(_FOLDS)]
         told = jnp.stack([_features(seen.inputs, part, points, self.latent) for part in parts])
         own = _features(seen.inputs, np.arange(len(fold)), points, self.latent)
-        tried = [_sets(own[None], whole.matrix[None], noise, held, few) for noise in _NOISES]
-        best = int(np.argmin([_worst(sets) for sets in tried]))
-        sets = _sets(told, _unseen(basis, train, whole.report.ridge, parts), _NOISES[best], seen, masks)
+        unseen = _unseen(basis, train, whole.report.ridge, parts)
+        tried = [_sets(told, unseen, noise, seen, masks) for noise in _NOISES]
+        best = int(np.argmin([_missing(sets) for sets in tried]))
+        sets, known = tried[best], _sets(own[None], whole.matrix[None], _NOISES[best], held, few)
         size = sets.spread
-        sets, known = sets.over(size), tried[best].over(size)
+        sets, known = sets.over(size), known.over(size)
         network = Network(self.width, self.depth, silent=True)
         trained = self.trained("point-set", SomePoints(network), sets, known, step)
         report = replace(whole.report, loss=losses(trained)).noting(*statuses(trained))
@@ -280,10 +281,10 @@ def _sets(
     return Sets(read, left, importance, jnp.ones(seen.targets.shape[2]))
 
 
-def _worst(sets: Sets) -> float:
-    """Mean squared error of light by fewer points than all, up to a factor; endless where it is not finite."""
-    squares = jnp.mean(sets.importance[1:, ..., None] * sets.left[1:] ** 2)
-    return float(jnp.nan_to_num(squares, nan=jnp.inf))
+def _missing(sets: Sets) -> float:
+    """Error of light by fewer points than all, the geometric mean over sets, up to a factor; endless where not finite."""
+    squares = jnp.mean(sets.importance[1:, ..., None] * sets.left[1:] ** 2, (1, 2, 3))
+    return float(jnp.nan_to_num(jnp.mean(jnp.log(jnp.maximum(squares, jnp.finfo(jnp.float32).tiny))), nan=jnp.inf))
 
 
 def _unseen(
