@@ -96,11 +96,16 @@ def test_half_of_the_points_tell_all_where_they_can(fitted: SetEncoder, parts: t
 
 
 def test_points_nearby_stand_in(fitted: SetEncoder, parts: tuple[Examples, Examples, Examples]) -> None:
-    """A hundredth of the room beside a trained point, another answers as that one does: weights fall with d^-4."""
+    """A thousandth of the room beside a trained point, another answers as that one does: weights fall with d^-4.
+
+    The points are a tenth of the room apart or more: 23 others weigh 23 (3e-6 / 1e-2)^2 = 2e-6 together, and what the noise of
+    1e-6 or more lets through makes features no more than a thousand times as important.
+    """
     test = parts[2]
-    moved = replace(test, frame=replace(test.frame, positions=test.frame.positions + 0.01))
+    moved = replace(test, frame=replace(test.frame, positions=test.frame.positions + 1e-3))
     there, beside = (fitted.predict(part.frame) for part in (some(test, np.arange(12)), some(moved, np.arange(12))))
-    np.testing.assert_allclose(beside, there, atol=1e-3 * float(jnp.abs(there).max()), rtol=0)
+    np.testing.assert_allclose(beside, there, atol=2e-3 * float(jnp.abs(there).max()), rtol=0)
+    assert (np.asarray(beside) != np.asarray(there)).any()
 
 
 def test_a_network_that_is_worth_something_is_taken(bent: tuple[SetEncoder, Examples]) -> None:
