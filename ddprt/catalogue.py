@@ -20,5 +20,5 @@ class Catalogue(dict[str, Entry], Generic[Entry]):
         self.update(entries)
 
     def __missing__(self, name: str) -> Entry:
-        known = ", ".join(sorted(self))
+        known = ", ".join(sorted(self)) or "none"
         raise UserError(f'no {self.noun} "{name}"{nearest(str(name), self)}; known: {known}')

@@ -12,12 +12,12 @@ import numpy as np
 from ddprt import __version__
 from ddprt.config import Config
 from ddprt.dataset.forecast import Forecast, forecast
+from ddprt.dataset.forecast_effects import belongs
 from ddprt.dataset.generate import bake
-from ddprt.dataset.sameness import other_settings
+from ddprt.dataset.sameness import check_skies, other_settings
 from ddprt.dataset.store import Dataset, open_dataset
 from ddprt.errors import UserError
 from ddprt.files import make_folder, write_text
-from ddprt.lights import LIGHTS
 from ddprt.machine import machine, peak_memory_gib
 from ddprt.progress import Progress
 from ddprt.scene.mesh import Scene
@@ -54,11 +54,22 @@ class Run:
                 self.progress.say(f"scene: {note}")
         return self._scene
 
-    def bake(self) -> Dataset:
-        """Bakes (or goes on with, or finds finished) the dataset; writes the resolved configuration."""
-        from ddprt.methods.names import check_names
+    def _check(self) -> None:
+        """Refuses what a run would stumble over at its end."""
+        from ddprt.methods.names import check_names  # takes its time
 
         check_names(self.config)
+        self._check_views()
+
+    def _check_views(self) -> None:
+        if self.config.report.views:
+            from ddprt.report.eyes import check_eyes
+
+            check_eyes(self.scene, self.config.report.views, layers=self.config.effects.glossy_layers)
+
+    def bake(self) -> Dataset:
+        """Bakes (or goes on with, or finds finished) the dataset; writes the resolved configuration."""
+        self._check()
         scene = self.scene
         make_folder(self.folder)
         if self.config.lightings.target_error:
@@ -75,9 +86,7 @@ class Run:
     def forecast(self) -> Forecast:
         """What `bake` would take from nothing; samples of files are written beside the folder of the run, and removed."""
         begun = time.perf_counter()
-        from ddprt.methods.names import check_names  # takes its time, as it will when the bake begins
-
-        check_names(self.config)
+        self._check()  # takes its time, as it will when the bake begins
         scene, loading = self.scene, time.perf_counter() - begun
         beside = next(path for path in self.folder.absolute().parents if path.is_dir())
         return forecast(scene, self.config, self.progress, beside=beside, loading=loading)
@@ -91,14 +100,17 @@ class Run:
         baked = [stage for stage in earlier if not str(stage["name"]).startswith(_AFTER_BAKE)]
         self.progress.stages[:] = [{**stage, "earlier": "yes"} for stage in baked] or self.progress.stages
 
-    def dataset(self) -> Dataset:
+    def dataset(self, *, shines: bool = False) -> Dataset:
         """The finished dataset of this run's folder.
 
+        Args:
+          shines: whether its lightings are to shine again, for which the pictures of skies must be there.
         Raises:
-          UserError: there is none, or it is of another scene or atlas.
+          UserError: there is none, it is of another scene or atlas, or it lacks such a picture.
         """
         if not (self.folder / "dataset" / "dataset.json").is_file():
             raise UserError(f"{self.folder}: got no dataset, expected a run folder; run `ddprt bake` with the same --out first")
+        self._check_views()
         data = open_dataset(self.folder / "dataset")
         differs = other_settings(data.description, self.config, self.scene)
         if differs:
@@ -107,20 +119,29 @@ class Run:
                 f'{self.folder}: got a dataset of scene "{name}" baked otherwise ({differs}), expected '
                 f'"{self.scene.name}" as configured now; bake again into another --out'
             )
+        if shines:
+            check_skies(data.description, data.lightings)
         return data
 
     def fit(self, data: Dataset) -> tuple[dict[str, Any], dict[str, float]]:
-        """Fits every method of the comparison and saves the main one; returns models and seconds by name."""
+        """Fits every method of the comparison and saves the main one; returns models and seconds by name.
+
+        What trains leaves its JSON lines in the folder `training`, and until the main model is saved, checkpoints: who was
+        interrupted goes on from there.
+        """
         from ddprt.methods.statuses import NOTES, STATUSES, worst_first
         from ddprt.runtime.train import fit_config
+        from ddprt.training.journal import keeping
 
         names = [self.config.fit.method, *(name for name in self.config.methods.compare if name != self.config.fit.method)]
         models, seconds = {}, {}
         for name in names:
             with self.progress.stage(f"fit {name}") as stage:
-                start = time.perf_counter()
-                models[name] = fit_config(data, self.config, name)
-                seconds[name] = time.perf_counter() - start
+                start, folder = time.perf_counter(), self.folder / "training" / name
+                tensorboard, every = self.config.fit.tensorboard, self.config.fit.checkpoint_seconds
+                with keeping(folder, stage, tensorboard=tensorboard, every=every, anew=self.progress.warn) as kept:
+                    models[name] = fit_config(data, self.config, name)
+                seconds[name] = time.perf_counter() - start + kept.earlier
                 stage.facts["status"] = models[name].relighter.report.status
         main = models[names[0]]
         report = main.relighter.report
@@ -134,7 +155,13 @@ class Run:
             told = ", ".join(name for name, found in remarks.items() if remark in found)
             line = f"{told}: {remark}: {STATUSES.get(remark, '')}"
             self.progress.say(f"note: {line}") if remark in NOTES else self.progress.warn(line)
+        for name, model in models.items():
+            if model.relighter.report.trouble:
+                self.progress.warn(f"{name}: {model.relighter.report.trouble}")
         main.save(self.folder / "model.ddprt")
+        for name in names:  # another fit is to take its own time
+            for path in (self.folder / "training" / name).glob("*.safetensors"):
+                path.unlink()
         write_text(self.folder / "config.toml", self.config.to_toml())
         return models, seconds
 
@@ -182,8 +209,9 @@ class Run:
     def report(self, data: Dataset, models: dict[str, Any], evaluation: Any, *, budget: dict[str, Any] | None = None) -> Path:
         """Writes report.html; `budget` is what `Run.budget` gave."""
         from ddprt.report.page import write_page
+        from ddprt.training.journal import seconds_of
 
-        path = self.folder / "report.html"
+        path, trained = self.folder / "report.html", self.folder / "training"
         with self.progress.stage("report"):
             write_page(
                 path,
@@ -197,6 +225,7 @@ class Run:
                 effect_costs={str(row["name"]): row for row in self.costs(data)},
                 command=self.command,
                 budget=budget,
+                seconds={name: seconds_of(trained / name, model.relighter.report.loss) for name, model in models.items()},
             )
         return path
 
@@ -277,8 +306,7 @@ class Run:
 def _effects(effects: Plan, stages: list[dict[str, Any]], data: Dataset) -> list[dict[str, Any]]:
     """The plan with what each effect cost and what it gave.
 
-    A stage belongs to the effect whose name it begins with; those of direct light to every kind of light, those of indirect
-    light to the bounces. Shares are of all irradiance of all lightings; direct light is shared out equally among the kinds of a
+    Shares are of all irradiance of all lightings; direct light is shared out equally among the kinds of a
     lighting's lights. None stands for what cannot be told apart: what an effect does within the stages of others, which
     `ddprt bench --effects` measures.
     """
@@ -295,9 +323,7 @@ def _effects(effects: Plan, stages: list[dict[str, Any]], data: Dataset) -> list
             energy[kind] = energy.get(kind, 0.0) + float(amount) / len(lighting)
     total, rows = sum(energy.values()), []
     for effect in effects.effects:
-        lights = effect.name.removesuffix(" lights") in LIGHTS
-        begins = "indirect" if effect.name == "diffuse bounces" else "direct" if lights else effect.name
-        own = [stage for stage in stages if f"{stage['name']} ".startswith(f"{begins} ") and effect.called]
+        own = [stage for stage in stages if belongs(str(stage["name"]), effect.name) and effect.called]
         rays, seconds = sum(int(s.get("rays", 0)) for s in own), sum(float(s["seconds"]) for s in own)
         apart = bool(own) or not effect.called
         share = energy.get(effect.name, None if effect.called else 0.0)

@@ -12,6 +12,7 @@ from ddprt.machine import PACKAGES, installed, machine
 from ddprt.progress import amount
 
 _LOOKED_AT = 8  # lightings that stand for all
+_FORESEEN = "gloss", "cut-outs", "two-sided sheets", "emission", "probes"  # what takes more than lamps and bounces
 
 
 def describe(source: str, overrides: dict[str, str]) -> str:
@@ -71,8 +72,27 @@ def describe(source: str, overrides: dict[str, str]) -> str:
         elif effects.bounces and any(light.any() for light in direct):
             told, costs["diffuse bounces"] = _gathering(config, tracer, atlas, lightings, direct)
             bake += told
+        if any(effects.called(name) for name in _FORESEEN):
+            told, foreseen = _foreseen(scene, config)
+            bake, costs = bake + told, {**foreseen, **costs}
     known = [line for line in effects.lines(costs) if lightings or not line.split(":")[0].endswith(" lights")]
     return "\n".join([*lines, *(f"effect      {line}" for line in known), *bake])
+
+
+def _foreseen(scene: Any, config: Config) -> tuple[list[str], dict[str, str]]:
+    """What to say of a bake that is foreseen, and what each effect will take, as `ddprt bake --dry-run` tells."""
+    import warnings
+
+    from ddprt.dataset.forecast import forecast
+    from ddprt.progress import Doubt
+
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", Doubt)
+        try:
+            costs = dict(forecast(scene, config).effects.costs)
+        except UserError as error:
+            return [f"            what effects take cannot be told: {error}"], {}
+    return [f"            {one.message}" for one in told if issubclass(one.category, Doubt)], costs
 
 
 def _some_lightings(config: Config, scene: Any, tracer: Any) -> tuple[Any, list[str]]:

@@ -211,6 +211,10 @@ class FitConfig(Section):
     ridge: Literal["auto"] | Annotated[float, Field(ge=0.0)] | tuple[Annotated[float, Field(ge=0.0)], ...] = Field(
         "auto", description="auto (leave-one-out), a number, or one number per measurement point; 0 is the pseudo-inverse"
     )
+    checkpoint_seconds: float = Field(
+        10.0, ge=0.0, description="learned methods: least seconds between checkpoints, which an interrupted fit goes on from"
+    )
+    tensorboard: bool = Field(False, description="learned methods: event files beside the JSON lines (extra tensorboard)")
 
 
 class MethodsConfig(Section):

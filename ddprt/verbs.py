@@ -92,7 +92,7 @@ def fit(call: Call) -> None:
 def evaluate(call: Call) -> None:
     """score all methods on held-out lightings and write the report"""
     job = call.run()
-    data = job.dataset()
+    data = job.dataset(shines=True)
     models, seconds = job.fit(data)
     evaluation = job.evaluate(data, models, seconds)
     budget = job.budget(data, models) if call.asks("budget") else None
@@ -106,8 +106,16 @@ def evaluate(call: Call) -> None:
 
 def bench(call: Call) -> None:
     """try settings about a configuration: error against seconds, bytes and memory"""
-    if call.asks("peers") and call.asks("effects"):
-        raise UserError("ddprt bench: got --peers and --effects, expected one of them; run it once for each")
+    asked = [f"--{flag}" for flag in ("peers", "effects", "methods") if call.asks(flag)]
+    if len(asked) > 1:
+        raise UserError(f"ddprt bench: got {' and '.join(asked)}, expected one of them; run it once for each")
+    if call.asks("methods"):
+        if given := [*call.files, *(f"--{key}" for key in (*call.overrides, *call.options) if key not in ("methods", "quiet"))]:
+            raise UserError(f"ddprt bench: got --methods and {given[0]}, expected --methods alone; it lists what is installed")
+        from ddprt.methods.listing import table
+
+        print(table())
+        return None
     if call.asks("peers"):
         return peers(call)
     if call.asks("quick"):
@@ -280,6 +288,7 @@ VERBS = {
         options=_OUT,
         flags={
             "peers": "compare fit, transfer and relighting with other libraries; FILE may be left out",
+            "methods": "list all methods, those of other packages too, with their settings; no FILE",
             "effects": "what each effect that is called for changes in light, seconds and rays",
             "quick": "less of it",
         },

@@ -19,6 +19,7 @@ from ddprt.runtime.model import Model
 SETTINGS: dict[str, dict[str, Any]] = {
     "mlp": {"steps": 300, "width": 32},
     "residual": {"steps": 300, "width": 32},
+    "neural-lightmap": {"steps": 100, "width": 8},
     "sh-prt": {"order": 1, "space": "linear"},
     "light-network": {"features": 16, "length": 1.0, "steps": 100, "space": "linear"},
     "point-set": {"steps": 100, "width": 16},

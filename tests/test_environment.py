@@ -533,6 +533,14 @@ def test_radiance_pictures_are_divided_by_all_their_exposures(tmp_path: Path) ->
     np.testing.assert_array_equal(found[2], found[0] * 2)
 
 
+def test_radiance_pictures_are_divided_by_all_their_colour_corrections(tmp_path: Path) -> None:
+    path = tmp_path / "a.hdr"
+    path.write_bytes(exposed(key="COLORCORR"))
+    plain = read_panorama(str(path))
+    path.write_bytes(corrected("2 4 0.5", " 2  1 1 ").replace(b"FORMAT", b"EXPOSURE=8\nFORMAT", 1))
+    np.testing.assert_array_equal(read_panorama(str(path)), plain / np.array([32, 32, 4], np.float32))
+
+
 @pytest.mark.parametrize("channels", [1, 3, 4])
 def test_exr_pictures_of_any_channels_and_aspect(tmp_path: Path, channels: int) -> None:
     pixels = np.random.default_rng(0).random((7, 5, channels)).astype(np.float32)
@@ -576,9 +584,14 @@ def depth(path: Path) -> None:
     OpenEXR.File(header, {"Z": np.ones((4, 8), np.float32)}).write(str(path))
 
 
-def exposed(*values: str) -> bytes:
-    """`GOOD_HDR` with such EXPOSURE lines."""
-    return GOOD_HDR.replace(b"FORMAT", "".join(f"EXPOSURE={value}\n" for value in values).encode() + b"FORMAT")
+def exposed(*values: str, key: str = "EXPOSURE") -> bytes:
+    """`GOOD_HDR` with such lines."""
+    return GOOD_HDR.replace(b"FORMAT", "".join(f"{key}={value}\n" for value in values).encode() + b"FORMAT")
+
+
+def corrected(*values: str) -> bytes:
+    """`GOOD_HDR` with such COLORCORR lines."""
+    return exposed(*values, key="COLORCORR")
 
 
 PICTURE = ", expected an EXR or HDR picture; check the path or write it again$"
@@ -604,6 +617,10 @@ BAD: dict[str, tuple[str, Callable[[Path], object] | None, str]] = {
     "exposed to words": ("sky.hdr", lambda path: path.write_bytes(exposed("1", "much")), 'got "EXPOSURE=much", expected'),
     "exposed for ever": ("sky.hdr", lambda path: path.write_bytes(exposed("inf")), 'got "EXPOSURE=inf", expected finite'),
     "exposed too far": ("sky.hdr", lambda path: path.write_bytes(exposed(*["1e200"] * 2)), 'got "EXPOSURE=1e200", expected'),
+    "no colour": ("sky.hdr", lambda path: path.write_bytes(corrected("1 0 1")), 'got "COLORCORR=1 0 1", expected 3'),
+    "two colours": ("sky.hdr", lambda path: path.write_bytes(corrected("1 2")), 'got "COLORCORR=1 2", expected 3'),
+    "an empty colour": ("sky.hdr", lambda path: path.write_bytes(corrected("")), 'got "COLORCORR=", expected 3'),
+    "turned twice": ("sky.hdr", lambda path: path.write_bytes(corrected("-1 1 1", "-1 1 1")), 'got "COLORCORR=-1 1 1"'),
     "too large": ("sky.hdr", lambda path: path.write_bytes(GOOD_HDR.replace(b"X 16", b"X 99999")), "got 99999 x 4 pixels"),
 }  # fmt: skip
 

@@ -37,6 +37,7 @@ def glowing(name: str) -> Scene:
         ("neon", 64, {"test_samples": 64, "bounces": 0}, {}),
         ("neon", 48, {"test_samples": "auto", "target_noise": 0.02}, {}),
         ("statue", 64, {"bounces": 1}, {"grid": [3, 3, 3], "rays": "auto"}),
+        ("glossy-room", 48, {"samples": 4, "test_samples": 8}, {"grid": [2, 2, 2], "rays": 128}),
     ],
 )
 def test_layers_and_what_glows_come_as_foretold(

@@ -1,6 +1,7 @@
 """Held-out lightings that a search draws when those of the configuration do not tell: on real small bakes."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +11,25 @@ from small_job import base
 
 from ddprt.bench.measure.settings import Setting
 from ddprt.bench.measure.trial import Workshop
-from ddprt.bench.tune.held_out import HeldOut, error_of, spread_of
+from ddprt.bench.measure.yardstick import Yardstick
+from ddprt.bench.tune import held_out as module
+from ddprt.bench.tune.held_out import Fitted, HeldOut, error_of, spread_of
 from ddprt.bench.tune.planner import Plan, Planner
 from ddprt.bench.tune.search import Search
-from ddprt.lights import lighting_json
+from ddprt.bench.tune.suspects import draw_candidates, unknown
+from ddprt.config import Config
+from ddprt.lights import lighting_json, parse_lighting
 from ddprt.progress import Progress
 from ddprt.runtime.train import fit_config
 
 QUIET = Progress(quiet=True)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_candidates() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(draw_candidates, "__defaults__", (24,))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -25,52 +37,78 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Workshop:
     return Workshop(base(), tmp_path_factory.mktemp("held-out"), QUIET)
 
 
+@pytest.fixture(scope="module")
+def fitted(workshop: Workshop) -> Fitted:
+    data, _ = workshop.bake(Setting({}, base()))
+    model = fit_config(data, base(), "svd-ridge")
+    return lambda: (model, data)
+
+
 def drawn(held_out: HeldOut) -> list[str]:
     yardsticks = held_out.workshop.yardstick, *held_out._more
     return [repr(each.data.lightings[index]) for each in yardsticks for index in each.held_out]
 
 
-def test_each_time_there_are_twice_as_many_and_all_differ(workshop: Workshop) -> None:
+def test_each_time_there_are_more_of_the_same_density(workshop: Workshop, fitted: Fitted) -> None:
     held_out = HeldOut(workshop)
     assert held_out.count == 4
     first = drawn(held_out)
-    assert held_out.more(0.5, 0.0), "the first doubling is never too dear"
-    assert not held_out.more(0.5, 0.0), "the second is"
+    assert held_out.more(fitted, 0.5, 0.0), "the first doubling is never too dear"
+    assert not held_out.more(fitted, 0.5, 0.0), "the second is"
     assert held_out.count == 8
-    assert held_out.more(0.5, 1e9)
-    assert held_out.count == 16
-    assert len({*drawn(held_out)}) == 16
+    assert held_out.more(lambda: pytest.fail("drawn for another model"), 0.5, 1e9, 3)
+    assert held_out.count == 24
+    assert len({*drawn(held_out)}) > 8, "a candidate may come twice"
     assert drawn(held_out)[:4] == first
-    assert held_out.more(0.5, 1e9, 4)
-    assert held_out.count == 64
+    candidates = json.loads(next(workshop.folder.glob("truth-*-candidates/lightings.json")).read_text())
+    assert {*drawn(held_out)[4:]} < {repr(parse_lighting(each)) for each in candidates}
     again = HeldOut(workshop)
-    assert again.more(0.5, 0.0)
+    assert again.more(fitted, 0.5, 0.0)
     assert drawn(again) == drawn(held_out)[:8]
-    assert 0 < again.seconds < held_out.seconds, "what lay there is told as it was baked"
-    took = json.loads(next(workshop.folder.glob("truth-*-4-*/took.json")).read_text())
-    assert again.seconds == took["seconds"]
+    took = [
+        json.loads(next(workshop.folder.glob(f"truth-*-{what}/took.json")).read_text())["seconds"]
+        for what in ("candidates", "0-4-*")
+    ]
+    assert again.seconds == sum(took) < held_out.seconds, "what lay there is told as it was baked"
 
 
-def test_their_maps_are_as_fine_as_a_tenth_of_the_limit_asks(workshop: Workshop) -> None:
+def test_their_maps_are_as_fine_as_a_tenth_of_the_limit_asks(
+    workshop: Workshop, fitted: Fitted, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[Config] = []
+
+    def note(_: Any, config: Config, *__: Any) -> Yardstick:
+        asked.append(config)
+        return workshop.yardstick
+
+    monkeypatch.setattr(module, "make_yardstick", note)
     for limit, noise in ((0.5, 0.3), (4.0, 0.4), (100.0, 1.0)):  # the configuration's is 0.3
-        held_out = HeldOut(workshop)
-        assert held_out.more(limit, 0.0)
-        settings = held_out._more[0].data.description["transport"]
-        assert settings["target_noise"] == noise
+        assert HeldOut(workshop).more(fitted, limit, 0.0)
+        assert asked[-1].bench.noise == noise
 
 
-def test_errors_are_pooled_over_all_of_them(workshop: Workshop) -> None:
-    model = fit_config(workshop.bake(Setting({}, base()))[0], base(), "svd-ridge")
+def test_errors_are_pooled_over_all_of_them_by_what_each_counts_for(workshop: Workshop, fitted: Fitted) -> None:
+    model, data = fitted()
     held_out = HeldOut(workshop)
     few = held_out.tally(model)
-    held_out.more(0.5, 0.0)
-    tally = held_out.tally(model)
-    assert np.array_equal(tally.error[:4], few.error)
-    assert len(tally.error) == 8
-    other = held_out._more[0].tally(model)
-    pooled = np.sqrt((few.error.sum() + other.error.sum()) / 8) / ((few.mean.sum() + other.mean.sum()) / 24)
-    assert error_of(tally) == pytest.approx(float(pooled), rel=1e-12)
-    assert spread_of(tally) != spread_of(few)
+    assert held_out.spread(few) == spread_of(few, 2.0)
+    held_out.more(fitted, 0.5, 0.0)
+    tally, other = held_out.tally(model), held_out._more[0].tally(model)
+    # Four drawn evenly and four by a density: each counts 8 / (4 + 4 d), d by what the model's own points measure.
+    candidates = [parse_lighting(each) for each in json.loads(next(workshop.folder.glob("*-candidates/*s.json")).read_text())]
+    known = data.values(data.split("train"), model.points, model.quantity)
+    average = unknown(np.stack([model.measure(each) for each in candidates]), known).mean()
+    yardsticks = workshop.yardstick, held_out._more[0]
+    lightings = [each.data.lightings[index] for each in yardsticks for index in each.held_out]
+    density = 0.2 + 0.8 * unknown(np.stack([model.measure(each) for each in lightings]), known) / average
+    weight = 8 / (4 + 4 * density)
+    assert tally.error == pytest.approx(weight * np.concatenate([few.error, other.error]), rel=1e-6)
+    mean = (weight[:, None] * np.concatenate([few.mean, other.mean])).mean()
+    assert error_of(tally) == pytest.approx(float(np.sqrt(tally.error.mean()) / mean), rel=1e-6)
+    spread, skew = held_out.spread(tally)
+    own = spread_of(tally)
+    assert own[0] < spread < 2 * own[0], "few candidates more leave little open"
+    assert abs(skew) <= abs(own[1])
 
 
 def test_a_file_has_no_others(workshop: Workshop, tmp_path: Path) -> None:
@@ -79,7 +117,7 @@ def test_a_file_has_no_others(workshop: Workshop, tmp_path: Path) -> None:
     listed.write_text(json.dumps([lighting_json(lighting) for lighting in data.lightings]))
     counts = {f"lightings__{split}": len(data.split(split)) for split in ("train", "validation", "test")}
     shop = Workshop(base(lightings__file=str(listed), **counts), tmp_path, QUIET)
-    assert not HeldOut(shop).more(0.5, 1e9)
+    assert not HeldOut(shop).more(lambda: pytest.fail("asked for"), 0.5, 1e9)
 
 
 def test_what_was_tried_is_scored_on_all_before_another_bake(workshop: Workshop, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -102,7 +140,7 @@ def test_what_was_tried_is_scored_on_all_before_another_bake(workshop: Workshop,
     model = fit_config(workshop.bake(Setting({}, base()))[0], base(fit__bases=trial.bases[-1]), "svd-ridge")
     # Stored as halves, which a trial's errors are of: a basis is rounded by a share of 2**-11, its light by no more.
     assert trial.errors[-1] == pytest.approx(error_of(search.held_out.tally(model)), abs=2 * 2**-11)
-    assert trial.error_spread == pytest.approx(spread_of(search.held_out.tally(model))[0], rel=0.02)
+    assert trial.error_spread == pytest.approx(search.held_out.spread(search.held_out.tally(model))[0], rel=0.02)
     assert len(search.planner.trials) == 1
     monkeypatch.undo()
     assert search.planner.trials[0].errors[-1] == pytest.approx(trial.errors[-1], abs=1e-3)

@@ -101,6 +101,9 @@ def test_the_lightmap_is_learned_as_without_layers(data: Dataset, plain: Dataset
     np.testing.assert_array_equal(ours.predict(values), alone.predict(values))
     assert list(ours.layers) == ["probes"]
     assert not alone.layers
+    for model, name, known in ((ours, "probs", 'did you mean "probes".; known: probes'), (alone, "probes", "known: none")):
+        with pytest.raises(UserError, match=f'no layer "{name}".*{known}'):
+            model.layers[name]
 
 
 def test_a_layer_is_learned_with_its_sign(data: Dataset) -> None:

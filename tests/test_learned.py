@@ -1,5 +1,6 @@
 """Learned methods: what each is known to find, or to keep."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -9,11 +10,16 @@ import numpy as np
 import pytest
 from scipy.linalg import subspace_angles
 
-from ddprt.fitting.basis import entry_weights
-from ddprt.methods import METHODS
-from ddprt.methods.method import Examples, Frame
+from ddprt.fitting import basis as bases
+from ddprt.fitting.basis import entry_weights, fit_basis
+from ddprt.lights import DirectionalLight
+from ddprt.methods import METHODS, learned
+from ddprt.methods.learned import Learned, Seen
+from ddprt.methods.method import Examples, Frame, columns, grouped
 from ddprt.methods.residual import Residual
 from ddprt.methods.svd_ridge import SvdRidge
+from ddprt.runtime import train
+from ddprt.training import loop
 
 EPS32 = float(np.finfo(np.float32).eps)
 KEY = jax.random.key(0)
@@ -106,3 +112,110 @@ def test_a_gate_is_the_best_share(monkeypatch: pytest.MonkeyPatch) -> None:
     assert 0 < gate < 1
     errors = [error(replace(found, gate=jnp.asarray(gate + step, jnp.float32)), held) for step in (-0.05, 0.0, 0.05)]
     assert errors[1] <= min(errors) * (1 + 1e-5)
+
+
+@pytest.mark.parametrize("name", [name for name, method in METHODS.items() if issubclass(method, Learned)])
+def test_every_learned_method_says_that_it_diverged_and_how(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loop, "_trouble", lambda history: "made up" if history else "")
+    few = {"steps": 2, "check_every": 1, "bases": 8, "width": 4}
+    method = METHODS[name](**{key: value for key, value in few.items() if key in METHODS[name].model_fields})
+    train, held = lit(examples(1)), lit(examples(2, 12))  # as in other tests, so that not all compiles anew
+    report = method.fit(train, held, key=KEY).report
+    assert report.trouble == "made up"
+    assert "diverged" in report.remarks
+    assert [look[0] for look in report.loss] == [1]
+    assert np.isfinite(report.loss).all()
+
+
+def lit(part: Examples) -> Examples:
+    """With a sun for each lighting, for methods that look at the lights themselves."""
+    suns = [(DirectionalLight(direction=(0.1 * i, -1.0, 0.2), irradiance=(1.0, 1.0, 1.0)),) for i in range(len(part.scale))]
+    return replace(part, frame=replace(part.frame, lightings=suns))
+
+
+class Sliced:
+    """Light that comes in blocks of a tile, and never as a whole."""
+
+    def __init__(self, light: np.ndarray) -> None:
+        self.light, self.shape = light, light.shape
+
+    def blocks(self) -> Iterator[jax.Array]:
+        for start in range(0, self.shape[1], bases._TILE):
+            yield jnp.asarray(self.light[:, start : start + bases._TILE])
+
+    def some(self, lightings: slice) -> jax.Array:
+        raise AssertionError("whole maps were asked for")
+
+
+def streamed(part: Examples) -> Examples:
+    return replace(part, indirect=Sliced(np.asarray(part.indirect)))
+
+
+@pytest.mark.parametrize("channels", ["mono", "multi"])
+def test_what_networks_learn_from_is_the_same_from_disk(channels: str) -> None:
+    """Two tiles and a piece, so that sums over texels are cut."""
+    part = replace(examples(1, 12, texels=2 * bases._TILE + 77), channels=channels)
+    groups = 3 if channels == "mono" else 1
+    entries = jnp.asarray(entry_weights(part.area, part.weights, channels))  # type: ignore[arg-type]
+    vectors = fit_basis(columns(part)[0], entries, bases=6).vectors
+    held, found = (Seen.of(one, groups, vectors, entries) for one in (part, streamed(part)))
+    for name in ("inputs", "importance", "size"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(held, name))
+    # Sums of n products in float32, in any order and any split, are each off by at most n eps / 2 of their magnitudes' sum.
+    light = np.asarray(grouped(part.indirect, groups), np.float64)
+    weights, U = np.asarray(entries, np.float64), np.asarray(vectors, np.float64)
+    bound = len(entries) * EPS32 * np.einsum("lge,be->lgb", np.abs(light) * weights, np.abs(U))
+    exact = np.einsum("lge,be->lgb", light * weights, U)
+    for one in (held, found):
+        assert (np.abs(np.asarray(one.targets) - exact) <= bound).all()
+    assert (np.abs(exact) > 100 * bound).any()
+
+
+@pytest.mark.parametrize(
+    ("name", "channels"),
+    [
+        ("mlp", "multi"),
+        ("residual", "mono"),
+        pytest.param("mlp", "mono", marks=pytest.mark.slow),
+        pytest.param("residual", "multi", marks=pytest.mark.slow),
+    ],
+)
+def test_a_network_learns_from_light_that_stays_on_disk(name: str, channels: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The basis is the same to the bit, and what is handed to training the same but for rounding."""
+    handed: list[tuple[Seen, Seen]] = []
+    train_whole = loop.train
+
+    def train(called: str, problem: Any, data: Seen, held: Seen, schedule: Any, key: jax.Array) -> Any:
+        handed.append((data, held))
+        return train_whole(called, problem, data, held, schedule, key)
+
+    monkeypatch.setattr(learned, "train", train)
+    parts = [replace(examples(seed, count, texels=bases._TILE + 77), channels=channels) for seed, count in ((1, 16), (2, 6))]
+    method = METHODS[name](bases=4, steps=2, check_every=1, width=4)  # type: ignore[call-arg]
+    assert method.streams
+    one, other = (method.fit(*given, key=KEY) for given in (parts, [streamed(part) for part in parts]))  # type: ignore[misc]
+    np.testing.assert_array_equal(np.asarray(one.basis), np.asarray(other.basis))
+    assert one.report.remarks == other.report.remarks
+    # As above; by Cauchy and Schwarz the magnitudes' sum is at most the norm of the light, as vectors have length 1. Targets
+    # are in units of `size`, and what the residual network takes from them comes from the very same basis, rounded once more.
+    for whole, cut, part in zip(*handed, parts, strict=True):
+        light = np.asarray(grouped(part.indirect, whole.inputs.shape[1]), np.float64)
+        entries = np.asarray(entry_weights(part.area, part.weights, channels), np.float64)  # type: ignore[arg-type]
+        norm = np.sqrt(np.einsum("lge,e->lg", light**2, entries))[..., None]
+        bound = 2 * len(entries) * EPS32 * (norm / np.asarray(whole.size) + np.abs(np.asarray(whole.targets)))
+        assert (np.abs(np.asarray(whole.targets) - np.asarray(cut.targets)) <= bound).all()
+
+
+def test_trouble_with_a_layer_is_told_by_the_model() -> None:
+    """Who looks at the model's report hears of its own trouble first, then of what a layer's training met."""
+    bare = METHODS["mean"]().fit(examples(1), examples(2, 12), key=KEY)
+    sound, broken = bare.report, diverged(bare, "no number").report
+    assert train._with_trouble_of(bare, {"probes": sound}) is bare
+    found = train._with_trouble_of(bare, {"probes": sound, "gloss-4": broken}).report
+    assert (found.status, found.trouble) == ("diverged", "layer gloss-4: no number")
+    both = train._with_trouble_of(diverged(bare, "none either"), {"gloss-4": broken}).report
+    assert both.trouble == "none either; layer gloss-4: no number"
+
+
+def diverged(relighter: Any, trouble: str) -> Any:
+    return replace(relighter, report=replace(relighter.report, trouble=trouble).noting("diverged"))

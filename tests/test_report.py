@@ -349,6 +349,14 @@ def test_page_without_scene_basis_or_check(job: Job) -> None:
     assert "not recorded" in page
 
 
+def test_page_without_scene_shows_a_basis_on_the_lightmap_alone(job: Job) -> None:
+    found = outline(job.write(scene=None))
+    assert found.open == []
+    titles = "".join(found.texts)
+    assert "First basis vectors" in titles
+    assert titles.count("in the view") == 0
+
+
 def test_page_of_darkness(job: Job) -> None:
     truth = type(job.evaluation.truth)(np.zeros_like(job.evaluation.truth.reference), job.data.area)
     metrics = {**job.evaluation.metrics, "dark_test_lightings": 5}
@@ -376,11 +384,13 @@ def test_warnings_speak_up_and_keep_quiet(job: Job) -> None:
     quiet["status"] = "ill_conditioned"
     metrics["dark_test_lightings"] = 2
     quiet["negative_share"] = 0.02
+    metrics["layers"] = {"gloss-4": {}, "probes": {"unlit": 1}}
     titles = [
         title for title, _ in warnings(evaluation, "svd-ridge", [Effect("diffuse bounces", True, "forced", None, True)], ["x"])
     ]
     assert titles == [
-        "svd-ridge: ill_conditioned", "Noisy references", "Spot check", "Dark test lightings", "Negative light",
+        "svd-ridge: ill_conditioned", "Noisy references", "Spot check", "Dark test lightings", "Probes without light",
+        "Negative light",
         "Effect cut short: diffuse bounces", "Scene repaired on loading",
     ]  # fmt: skip
 
@@ -444,7 +454,7 @@ def test_methods_are_sorted_by_error_and_complete(job: Job) -> None:
     assert [name for name, _ in rows][-1] == "unscored"
     errors = [scores[name]["relative_rmse"] for name, _ in rows[:-1]]
     assert errors == sorted(errors)
-    assert all(len(cells) == len(scores["svd-ridge"]) - 1 for _, cells in rows), "all but the remarks"
+    assert all(len(cells) == len(scores["svd-ridge"]) - 2 for _, cells in rows), "all but remarks and trouble"
 
 
 def test_numbers_for_people() -> None:
@@ -463,3 +473,24 @@ def test_page_needs_a_model_and_a_folder_to_write_to(job: Job, tmp_path: Path) -
     job_elsewhere.__dict__.update(job.__dict__, folder=tmp_path / "file")
     with pytest.raises(UserError, match="cannot be"):
         job_elsewhere.write(scene=None, models={"mean": job.models["mean"]})
+
+
+def test_every_learned_method_has_its_curves_over_steps_and_seconds(job: Job) -> None:
+    """Positive losses on a log axis; others, which are logarithms themselves, on a plain one. Who learned nothing has none."""
+    losses = {"svd-ridge": ((10, 0.5, 0.6), (20, 0.25, 0.3), (40, 0.125, 0.4)), "mean": ((10, 1.0, -2.0), (20, -1.0, -3.0))}
+    models = {
+        name: replace(model, relighter=replace(model.relighter, report=replace(model.relighter.report, loss=losses[name])))
+        for name, model in job.models.items()
+    }
+    page = job.write(models=models, seconds={"svd-ridge": [3.0, 3.5, 4.75]})
+    assert re.findall(r'aria-label="(Training of [^"]*)"', page) == ["Training of svd-ridge", "Training of mean"]
+    with_clock, without = (page.split(f'aria-label="Training of {name}"')[1].split("</figure>")[0] for name in losses)
+    labels = re.findall(r"<text[^>]*>([^<]*)</text>", with_clock)
+    # At steps 0, 10, 20, 30 and 40, between looks in proportion.
+    assert [label for label in labels if label in ("0", "3", "3.5", "4.12", "4.75", "seconds")][-6:] == [
+        "0", "3", "3.5", "4.12", "4.75", "seconds",
+    ]  # fmt: skip
+    assert "seconds" not in without
+    assert "10" in with_clock
+    assert {label.replace("\u2212", "-") for label in re.findall(r"<text[^>]*>([^<]*)</text>", without)} >= {"-3.0", "1.0"}
+    assert "Training of" not in job.write()

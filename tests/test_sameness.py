@@ -8,7 +8,7 @@ import pytest
 import ddprt
 from ddprt.config import checked
 from ddprt.dataset.probes import probe_layers
-from ddprt.dataset.sameness import differences, pictures
+from ddprt.dataset.sameness import check_skies, differences, pictures
 from ddprt.errors import UserError
 from ddprt.lights import parse_lighting
 from ddprt.scene.library import build
@@ -44,11 +44,28 @@ def test_a_sky_whose_picture_has_changed_makes_another_dataset(tmp_path: Path) -
     assert differences({}, {"skies": before}) != "", "a dataset of an older version, which knew of none"
 
 
-def test_probes_in_a_glossy_room_are_refused_unless_gloss_is_off() -> None:
-    config, scene = checked({"probes": {"grid": [2, 2, 2]}}), build("glossy-room")
-    with pytest.raises(UserError, match=r'takes "paths".* effects.off = \["gloss"\]'):
-        probe_layers(config, scene)
-    assert len(probe_layers(config, ddprt.force(scene, off=["gloss"]))) == 1
+@pytest.mark.parametrize("integrator", ["auto", "paths", "reference"])
+def test_probes_stand_in_a_glossy_room_whatever_makes_its_maps(integrator: str) -> None:
+    config, scene = checked({"probes": {"grid": [2, 2, 2]}, "transport": {"integrator": integrator}}), build("glossy-room")
+    assert len(probe_layers(config, scene)) == 1
+    if integrator != "auto":
+        with pytest.raises(UserError, match=rf'got "{integrator}", which knows no probes where nothing glosses'):
+            probe_layers(config, ddprt.force(scene, off=["gloss"]))
+
+
+def test_a_sky_that_is_to_shine_again_is_there_and_the_same(tmp_path: Path) -> None:
+    path = tmp_path / "sky.exr"
+    sky = [parse_lighting({"type": "environment", "image": name}) for name in (str(path), "sun-sky")]
+    path.write_bytes(b"one")
+    before = {"skies": pictures(sky)}
+    check_skies(before, sky)
+    check_skies({}, sky)  # of an older version, which knew of none
+    path.write_bytes(b"another")
+    with pytest.raises(UserError, match=r"sky\.exr: got another picture than the dataset was baked with"):
+        check_skies(before, sky)
+    path.unlink()
+    with pytest.raises(UserError, match=r"sky\.exr: got No such file"):
+        check_skies(before, sky)
 
 
 def test_black_surfaces_that_gloss_send_light_on() -> None:

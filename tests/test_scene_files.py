@@ -629,6 +629,12 @@ def test_masks_that_nothing_passes_are_none(tmp_path: Path) -> None:
         assert (gone.opacity < gone.cutoff).all()
 
 
+@pytest.mark.parametrize("mode", ["FOO", "mask"])
+def test_a_transparency_that_nobody_knows_is_refused(tmp_path: Path, mode: str) -> None:
+    with pytest.raises(UserError, match=f'got alphaMode "{mode}" of material "paint", expected OPAQUE, MASK or BLEND'):
+        load_scene(painted({"alphaMode": mode}).glb(tmp_path / "foo.glb"))
+
+
 def test_blending_is_a_mask_and_named(tmp_path: Path) -> None:
     blend = {"alphaMode": "BLEND", "alphaCutoff": 0.1, "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
     scene = load_scene(painted(blend, rgba_png(ALPHA)).glb(tmp_path / "blend.glb"))

@@ -1,8 +1,10 @@
 """The training loop: it learns, stops, breaks off and goes on."""
 
 import json
+import sys
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -13,7 +15,7 @@ import pytest
 from ddprt.errors import UserError
 from ddprt.progress import Progress
 from ddprt.training import loop
-from ddprt.training.journal import keeping
+from ddprt.training.journal import keeping, read_lines, seconds_of
 from ddprt.training.loop import Trained, train
 from ddprt.training.schedule import Schedule, rate
 
@@ -144,6 +146,108 @@ def test_a_checkpoint_of_another_training_is_refused(other: Any, tmp_path: Path,
     with keeping(tmp_path), pytest.raises(UserError, match="got a checkpoint of other settings, data or seed"):
         other()
     assert (tmp_path / "line.safetensors").read_bytes() == kept
+
+
+def test_a_checkpoint_of_another_training_makes_way_where_that_is_wanted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken_off(SCHEDULE, tmp_path, 2, monkeypatch)
+    said: list[str] = []
+    with keeping(tmp_path, anew=said.append):
+        found = trained(seed=5)
+    assert len(said) == 1
+    assert said[0].startswith(f"{tmp_path / 'line.safetensors'}: settings, data or seed are others")
+    assert bits(found) == bits(trained(seed=5))
+    assert len((tmp_path / "line.jsonl").read_text().splitlines()) == SCHEDULE.rounds
+    with keeping(tmp_path, anew=said.append):  # its own checkpoint stands in nobody's way
+        assert bits(trained(seed=5)) == bits(found)
+    assert len(said) == 1
+
+
+def test_trouble_is_not_forgotten_with_a_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A gradient beyond float32 leaves parameters that are finite, and a checkpoint: whoever goes on has the trouble too."""
+    whole = loop._round
+
+    def bad(*arguments: Any) -> Any:
+        state, seen = whole(*arguments)
+        return state, seen.at[2].set(jnp.inf) if int(state.step) == 60 else seen
+
+    with monkeypatch.context() as patch, keeping(tmp_path, every=0.0):
+        patch.setattr(loop, "_round", bad)
+        first = trained()
+    assert first.trouble.startswith("the gradient was not finite by step 60, at a learning rate of 0.0")
+    assert f"by step 40 the loss was {first.history[1].loss:.3g}" in first.trouble
+    assert len(first.history) == 3
+    with keeping(tmp_path):
+        again = trained()
+    assert (again.trouble, bits(again)) == (first.trouble, bits(first))
+    assert again.history == first.history
+
+
+def test_the_clock_goes_on_from_a_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    broken_off(SCHEDULE, tmp_path, 4, monkeypatch)
+    lines = read_lines(tmp_path / "line.jsonl")
+    (tmp_path / "line.jsonl").write_text("".join(json.dumps({**line, "seconds": 100.0}) + "\n" for line in lines))
+    with keeping(tmp_path) as kept:
+        found = trained()
+    assert kept.earlier == 100.0
+    looks = [(entry.step, entry.loss, entry.validation) for entry in found.history]
+    seconds = seconds_of(tmp_path, looks)
+    assert seconds[:4] == [100.0] * 4
+    assert all(100.0 <= moment < 1000.0 for moment in seconds[4:])
+    assert len(seconds) == SCHEDULE.rounds
+    assert seconds_of(tmp_path, looks[1:]) == []  # lines of another training
+    (tmp_path / "line.jsonl").unlink()
+    with keeping(tmp_path):
+        trained()  # the looks are in the checkpoint, their seconds are not
+    assert [line["step"] for line in read_lines(tmp_path / "line.jsonl")] == [entry.step for entry in found.history]
+    assert seconds_of(tmp_path, looks) == []
+
+
+def test_half_a_line_ends_the_lines(tmp_path: Path) -> None:
+    (tmp_path / "line.jsonl").write_text('{"step": 1}\n{"step": 2, "lo')
+    assert read_lines(tmp_path / "line.jsonl") == [{"step": 1}]
+    assert read_lines(tmp_path / "none.jsonl") == []
+
+
+def test_event_files_hold_what_the_lines_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever goes on takes back what was written past the checkpoint; whoever begins anew takes all of it back."""
+    begun: list[tuple[str, int | None]] = []
+    written: list[tuple[str, float, int]] = []
+
+    class Writer:
+        def __init__(self, folder: str, purge_step: int | None) -> None:
+            begun.append((folder, purge_step))
+
+        def add_scalar(self, name: str, value: float, step: int) -> None:
+            written.append((name, value, step))
+
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setitem(sys.modules, "tensorboardX", SimpleNamespace(SummaryWriter=Writer))
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: name)
+    broken_off(SCHEDULE, tmp_path, 3, monkeypatch)
+    with keeping(tmp_path, tensorboard=True):
+        found = trained()
+    folder = tmp_path / "line.events"
+    assert begun == [(str(folder), 61)]
+    assert [(value, step) for name, value, step in written if name == "validation"] == [
+        (entry.validation, entry.step) for entry in found.history[3:]
+    ]
+    folder.mkdir()
+    (folder / "events.old").write_text("")
+    with keeping(tmp_path, tensorboard=True, anew=lambda _: None):
+        trained(seed=5)
+    assert begun[1] == (str(folder), None)
+    assert not (folder / "events.old").exists()
+
+
+def test_the_terminal_counts_all_trainings_of_a_stage() -> None:
+    with Progress(quiet=True).stage("fit line") as stage, keeping(None, stage):
+        trained()
+        trained(seed=1)
+        assert (stage.done, stage.total) == (800, 800)
 
 
 def test_a_damaged_checkpoint_is_named(tmp_path: Path) -> None:

@@ -200,7 +200,7 @@ def test_scaling_the_light_otherwise_changes_rounding_alone(model: Model, values
 
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_has_trust(name: str, data: Dataset, values: np.ndarray, tmp_path: Path) -> None:
-    settings = {"mlp": {"steps": 200, "width": 16}, "residual": {"steps": 100}}.get(name)
+    settings = suns.SETTINGS.get(name)
     model = suns.fit(data, name, settings=settings, **({"bases": 6} if name == "svd-ridge" else {}))
     found = model.trust(values)
     assert found is not None

@@ -34,6 +34,7 @@ from ddprt import seeds
 from ddprt.config import Config
 from ddprt.dataset import store
 from ddprt.dataset.denoise import find_denoiser
+from ddprt.dataset.forecast_effects import effect_costs
 from ddprt.dataset.forecast_indirect import expect_indirect
 from ddprt.dataset.forecast_layers import expect_constant, expect_layers
 from ddprt.dataset.generate import check_points, sunk
@@ -50,7 +51,7 @@ from ddprt.sampling.points import Samples, load_samples, place_samples
 from ddprt.scene.mesh import Scene
 from ddprt.scene.unwrap import unwrap
 from ddprt.transport.direct import Texels
-from ddprt.transport.effects import plan
+from ddprt.transport.effects import Plan, plan
 from ddprt.transport.embree import Tracer
 from ddprt.transport.glossiness import scattering
 from ddprt.transport.measure import measure
@@ -69,6 +70,7 @@ class Forecast:
       training_seconds: without held-out lightings.
       peak_gib: resident memory at the highest, maps in the making included.
       parts: what dominates, longest first.
+      effects: the plan, with what each effect will take.
       spent: seconds that forecasting took.
     """
 
@@ -76,6 +78,7 @@ class Forecast:
     training_seconds: float
     peak_gib: float
     parts: tuple[Part, ...]
+    effects: Plan
     spent: float
 
     @property
@@ -111,6 +114,8 @@ class Forecast:
             lines.append(
                 f"of {self.seconds:.3g} s, {part.seconds:.2g} are {part.what}: {part.setting} would take about {part.then:.2g}"
             )
+        called = {effect.name for effect in self.effects.effects if effect.called}
+        lines += [f"effect {line}" for line in self.effects.lines() if line.split(":")[0] in called]
         return "\n".join(lines)
 
 
@@ -152,7 +157,7 @@ def _foreseen(scene: Scene, config: Config, folder: Path, progress: Progress, be
     entries, _ = choose_lightings(None, config.lightings, scene, tracer, config.seed)
     begun = staged("lightings")
     lightings = [lighting for _, lighting in entries]
-    bounces = plan(scene, lightings, bounces=config.transport.bounces).bounces
+    effects = plan(scene, lightings, bounces=config.transport.bounces, probes=config.probes.asked)
     between += time.perf_counter() - begun
     unwrap(scene, config.atlas.resolution, config.atlas.padding)  # kept for the bake, which finds it there
     begun = time.perf_counter()
@@ -166,7 +171,7 @@ def _foreseen(scene: Scene, config: Config, folder: Path, progress: Progress, be
         samples = place_samples(scene, wanted, on=config.points.on, seed=config.seed, atlas=atlas)
     samples = sunk(samples, lightings, config.points, tracer)
     staged("points")
-    job = Sampled(scene, config, folder, progress, tracer, lightings, bounces, atlas, Manifest(folder), peak)
+    job = Sampled(scene, config, folder, progress, tracer, lightings, effects.bounces, atlas, Manifest(folder), peak)
     placing, described = _placed(job, samples, entries)
     train, test = ([i for i, (name, _) in enumerate(entries) if (name == "test") is held] for held in (False, True))
     direct, seen, parts = _expect_direct(job, samples, train, test)
@@ -188,7 +193,8 @@ def _foreseen(scene: Scene, config: Config, folder: Path, progress: Progress, be
     tested = sum(stage.seconds for stage in stages if "test" in re.findall(r"\w+", stage.name))
     held_out = tested + reading * len(test) + direct.seconds * lamps[1] / sum(lamps)
     shorter = sorted((part for part in parts if part.then < part.seconds), key=lambda part: -part.seconds)
-    return Forecast(tuple(stages), sum(stage.seconds for stage in stages) - held_out, job.peak, tuple(shorter), 0.0)
+    effects = replace(effects, costs={**effects.costs, **effect_costs(job, stages, effects)})
+    return Forecast(tuple(stages), sum(stage.seconds for stage in stages) - held_out, job.peak, tuple(shorter), effects, 0.0)
 
 
 def _placed(job: Sampled, samples: Samples, entries: list[tuple[str, Lighting]]) -> tuple[float, int]:

@@ -13,11 +13,11 @@ from ddprt.dataset.forecast_indirect import SCRATCHED, direct_again
 from ddprt.dataset.gloss import RAYS_FOR_A_PATH, gloss_layers
 from ddprt.dataset.layers import Layer, write_light, write_places
 from ddprt.dataset.manifest import layer_name, map_name
-from ddprt.dataset.probes import Sent
 from ddprt.dataset.sampled import WIDE, Expected, Sampled, on_a_line, scratched
 from ddprt.dataset.store import read_map
 from ddprt.lights import Lighting
 from ddprt.scene.atlas import weights_at
+from ddprt.transport.sources import Sent
 
 _CHOICE = 7  # times as much as in float32 it holds of them: two runs and their difference in float64, one as it came
 
@@ -43,7 +43,7 @@ def expect_gloss(
         seconds, rays = 0.0, 0.0
         if job.bounces != 0 and exits.count:
             if lit is None:
-                lit, reading = _lit(job, indices, seen)
+                lit, reading = lit_by(job, indices, seen)
                 again = direct_again(job, seen, len(indices)) if halves > 1 else again
             seconds, rays = _traced(job, lit, layer, exits, split, len(indices))
             seconds, rays = seconds + again[0] + (1, 2.5)[halves - 1] * reading, rays + again[1]  # maps: 2, or 3 and 2
@@ -88,7 +88,7 @@ def _placed(job: Sampled) -> list[tuple[Layer, Any]]:
     return found
 
 
-def _lit(job: Sampled, indices: list[int], seen: list[int]) -> tuple[Any, float]:
+def lit_by(job: Sampled, indices: list[int], seen: list[int]) -> tuple[Any, float]:
     """The scene with stand-ins for its maps, and the seconds that reading two maps of each lighting takes."""
     direct, reading = _read(job, seen, len(indices))
     chosen = [indices[place] for place in np.linspace(0, len(indices) - 1, min(len(indices), WIDE)).astype(int)]

@@ -11,12 +11,12 @@ from ddprt import seeds
 from ddprt.axes import Float32, Int
 from ddprt.dataset.denoise import denoised
 from ddprt.dataset.manifest import map_name
-from ddprt.dataset.probes import Sent
 from ddprt.dataset.sampled import WIDE, Expected, Number, Part, Sampled, extrapolated, on_a_line, scratched
 from ddprt.dataset.store import read_map, write_map
 from ddprt.lights import Lighting
 from ddprt.transport.direct import Texels
 from ddprt.transport.glossiness import valid_integrator
+from ddprt.transport.sources import Sent
 
 _BLOCK = 16  # rows of an EXR that are compressed together
 _FEW, _LOOKED_AT = 8, 2  # rays and lightings that tell what maps look like

@@ -7,16 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from ddprt.dataset.forecast_gloss import expect_gloss, expect_gloss_constant
+from ddprt.dataset.forecast_gloss import expect_gloss, expect_gloss_constant, lit_by
+from ddprt.dataset.forecast_indirect import direct_again
 from ddprt.dataset.layers import write_light, write_places
 from ddprt.dataset.manifest import layer_name, map_name
-from ddprt.dataset.probes import NAME, Sent, placed_probes
+from ddprt.dataset.probes import NAME, name_shut, name_unlit, placed_probes, scatters, shown_glow
 from ddprt.dataset.sampled import Expected, Sampled, on_a_line
 from ddprt.dataset.store import CONSTANT, read_map, write_map
 from ddprt.transport.effects import plan, probed
 from ddprt.transport.glossiness import glossy
+from ddprt.transport.sources import Sent, Shown
 
 _TEXELS = 1 << 14  # that tell what samples of direct light cost, and how many are needed
+_LOOKS, _LOOKED_AT = 64, 1 << 12  # rays that tell whether any light reaches a probe, and probes that are asked
 _PLACES = 16, 64  # probes whose difference tells what a further one costs
 _STRAIGHT = 1 << 22  # samples of all texels together that bounce in place of all
 _SAMPLES = 64  # of each texel, at least: with fewer, their noise would ask for more gather rays
@@ -54,19 +57,34 @@ def _probes(
     write_places(job.folder, layer, job.manifest)
     if split == "train":
         nothing = Expected("places", time.perf_counter() - begun, 0, 1, job.size([layer_name(NAME, "places")]))
+        name_shut(layer, job.progress)
     seconds, rays, position = 0.0, 0.0, layer.position[layer.weight > 0]
-    if job.config.transport.bounces != 0 and any(entry.brightest for entry in job.scene.materials):
+    if job.config.transport.bounces != 0 and scatters(job.scene):
+        source: Sent | Shown
+        making, again = 0.0, (0.0, 0.0)
         before, begun = job.tracer.rays, time.perf_counter()
-        sent = sent or _sent(job, split, indices, seen)
-        columns = sent.bounced.radiosity.shape[1]
-        given, target = job.config.probes.rays, job.config.transport.target_noise
-        if given == "auto":
-            each, _ = module.choose_rays(sent.operator, sent.bounced.radiosity, position, target, halves=halves, **sent.address)
+        if any(glossy(job.scene)):
+            lit, reading = lit_by(job, indices, seen)
+            source, columns = Shown(lit, {"seed": job.config.seed, "stream": f"{split} 0"}), len(lit.lamps)
+            again = direct_again(job, seen, len(indices)) if halves > 1 else again
+            making = (1, 2.5)[halves - 1] * reading  # maps: 2, or 3 and 2
+            before, begun = job.tracer.rays, time.perf_counter()
+            step = import_module("ddprt.transport.lit_probes").CALL
         else:
-            each = module.power_of_two(given)
-        seconds, rays = time.perf_counter() - begun, float(job.tracer.rays - before)
-        more, traced = job.rounds(lambda some: _gathered(module, sent, some, each), position, max(1, module.CALL // each))
-        share = halves * 3 * len(indices) / columns  # of lightings past those whose columns were made
+            source = sent or _sent(job, split, indices, seen)
+            columns, step = source.bounced.radiosity.shape[1] // 3, module.CALL
+        given, target = job.config.probes.rays, job.config.transport.target_noise
+        each = source.choose_rays(position, target, halves)[0] if given == "auto" else module.power_of_two(given)
+        seconds, rays = time.perf_counter() - begun + making + again[0], float(job.tracer.rays - before) + again[1]
+        more, traced = job.rounds(lambda some: _gathered(source, some, each), position, max(1, step // each))
+        if split == "train":
+            some = np.flatnonzero(layer.weight > 0)
+            some = some[np.unique(np.linspace(0, len(some) - 1, min(len(some), _LOOKED_AT)).astype(int))]
+            light = np.concatenate(list(source.gather(layer.position[some], _LOOKS)), 1)
+            unlit = np.zeros(len(layer.weight), bool)
+            unlit[some[~light.any((0, 2, 3))]] = True
+            name_unlit(layer, unlit, job.progress)
+        share = halves * len(indices) / columns  # of lightings past those whose columns were made
         seconds, rays = seconds + share * more, rays + halves * traced
     storing, size = job.layered(layer, indices, halves)
     return [Expected(f"probes {split}", seconds + storing, int(rays), halves * len(indices), size)], nothing
@@ -90,8 +108,8 @@ def _sent(job: Sampled, split: str, indices: list[int], seen: list[int]) -> Sent
     return Sent(operator, operator.bounce(direct, bounces=1, **address), address | {"near": near})
 
 
-def _gathered(module: Any, sent: Sent, position: np.ndarray, rays: int) -> None:
-    for _ in module.gather(sent.operator, sent.bounced.radiosity, position, rays, **sent.address):
+def _gathered(source: Sent | Shown, position: np.ndarray, rays: int) -> None:
+    for _ in source.gather(position, rays):
         pass
 
 
@@ -211,7 +229,8 @@ def _constant_of_probes(job: Sampled, emitters: Any, light: np.ndarray) -> tuple
     for count in (_PLACES[0], *_PLACES):
         some = position[np.unique(np.linspace(0, len(position) - 1, min(count, len(position))).astype(int))]
         before, begun = job.tracer.rays, time.perf_counter()
-        address: dict[str, Any] = {"seed": config.seed, "bounces": job.bounces}
+        shown = shown_glow(job.tracer, job.scene, job.atlas, light, emitters, config.seed)
+        address: dict[str, Any] = {"seed": config.seed, "bounces": job.bounces, "shown": shown}
         glow.probe_light(emitters, job.tracer, job.atlas, light, some, config.transport, config.probes.rays, **address)
         found.append((len(some), time.perf_counter() - begun, job.tracer.rays - before))
     (_, cold, _), few, many = found

@@ -14,7 +14,7 @@ from ddprt.config import Config
 from ddprt.dataset.denoise import denoised
 from ddprt.dataset.gloss import GlossBake
 from ddprt.dataset.manifest import Manifest, map_name
-from ddprt.dataset.probes import ProbeBake, Sent
+from ddprt.dataset.probes import ProbeBake, scatters
 from ddprt.dataset.sampled import scratched, stored
 from ddprt.dataset.scratch import Scratch
 from ddprt.dataset.store import CONSTANT, Dataset, read_map, write_map
@@ -25,6 +25,8 @@ from ddprt.transport.direct import Texels
 from ddprt.transport.effects import Plan
 from ddprt.transport.embree import Tracer
 from ddprt.transport.footprint import Footprints
+from ddprt.transport.glossiness import glossy
+from ddprt.transport.sources import Sent, Shown
 
 _SHARE, _LARGE = 64, 1 << 26  # of maps in the making that is tried out; bytes below which they take no time that matters
 _REFERENCE_SAMPLES = 512  # paths of the reference where nothing else is asked for
@@ -61,8 +63,9 @@ class IndirectBake:
             sent = cache(sent)  # of maps and probes
         self._maps(split, indices, sent)
         if self._probes:
-            dark = self.config.transport.bounces == 0 or not any(entry.brightest for entry in self.scene.materials)
-            self._probes.run(split, indices, sent, self.progress, dark=dark)
+            dark = self.config.transport.bounces == 0 or not scatters(self.scene)
+            source = partial(self._seen, split, indices) if any(glossy(self.scene)) else sent
+            self._probes.run(split, indices, source, self.progress, dark=dark)
         for layer in self._glossy:
             layer.run(split, indices, partial(self._shown, split, indices), self.progress)
 
@@ -113,7 +116,7 @@ class IndirectBake:
                 )
             write_map(self.dataset.folder / CONSTANT, self.atlas.image(found.irradiance))
             self.manifest.add(CONSTANT)
-            more = probes.constant(found.direct, self.atlas, self.scene, self.effects.bounces) if probes else {}
+            more = probes.constant(found, self.atlas, self.scene, self.effects.bounces) if probes else {}
             for layer in glossy:
                 layer.constant(found.irradiance)
             stage.facts |= found.facts | more | {"rays": self.tracer.rays - before}
@@ -132,6 +135,12 @@ class IndirectBake:
         bounced = operator.bounce(direct, seed=self.config.seed, stream=stream, bounces=bounces)
         near = operator.near([self.dataset.lightings[index] for index in indices], direct, bounces=bounces)
         return Sent(operator, bounced, {"seed": self.config.seed, "stream": stream, "near": near})
+
+    def _seen(self, split: str, indices: list[int], half: int) -> Shown:
+        """What rays of probes end in where something glosses."""
+        lightings = [self.dataset.lightings[index] for index in indices]
+        seen = self.tracer, self.scene, self.atlas, lightings, self._shown(split, indices, half)
+        return Shown.of(*seen, seed=self.config.seed, stream=f"{split} {half}")
 
     def _by_operator(
         self,

@@ -1,6 +1,7 @@
 """The layer of probes in a dataset: where they stand, and their light under every lighting.
 
-Probes take the light that the senders send to the lightmap, so they cost their own rays alone. Held-out lightings are the mean
+Probes take the light that the senders send to the lightmap, so they cost their own rays alone; where something glosses their
+rays end in the lightmaps. Held-out lightings are the mean
 of two independent halves, with half their difference as "noise", as in the lightmap.
 """
 
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ddprt.axes import Float32
+from ddprt.axes import Bool, Float32
 from ddprt.config import Config
 from ddprt.dataset.layers import Layer, read_layer, write_halves, write_light, write_places
 from ddprt.dataset.manifest import Manifest, layer_lacks, layer_name
@@ -23,25 +24,16 @@ from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
 from ddprt.transport.effects import Plan, plan, probed
 from ddprt.transport.embree import Tracer
-from ddprt.transport.glossiness import valid_integrator
+from ddprt.transport.glossiness import glossy, valid_integrator
+from ddprt.transport.sources import Sent, Shown
 
 NAME = "probes"
 _NAMED = 8  # probes that a message spells out
 
 
-@dataclass(frozen=True)
-class Sent:
-    """Light on its way from the senders to whatever gathers it.
-
-    Attributes:
-      operator: the scene.
-      bounced: see `Operator.bounce`.
-      address: seed and stream of the random numbers, and the near field.
-    """
-
-    operator: Any
-    bounced: Any
-    address: dict[str, Any]
+def scatters(scene: Scene) -> bool:
+    """Whether any surface sends light on."""
+    return any(entry.brightest for entry in scene.materials) or any(glossy(scene))
 
 
 def probe_layers(config: Config, scene: Scene) -> list[dict[str, Any]]:
@@ -53,12 +45,10 @@ def probe_layers(config: Config, scene: Scene) -> list[dict[str, Any]]:
     if not probed(config, scene):
         return []
     integrator = valid_integrator(config.transport.integrator, scene)
-    if integrator != "operator":
-        asked = config.transport.integrator
-        why = f'"{asked}"' if integrator == asked else f'"{asked}", which takes "{integrator}" for what glosses'
+    if integrator != "operator" and not any(glossy(scene)):
         raise UserError(
-            f"transport.integrator: got {why} and knows no probes, expected the operator; set effects.off = "
-            f'["{"probes" if integrator == asked else "gloss"}"]'
+            f'transport.integrator: got "{integrator}", which knows no probes where nothing glosses, expected the operator; '
+            'set it to "auto", or effects.off = ["probes"]'
         )
     probes = import_module("ddprt.transport.probes")
     position = probes.places(config.probes, scene.bounds)
@@ -82,6 +72,15 @@ def placed_probes(module: ModuleType, config: Config, scene: Scene, tracer: Trac
         )
     weight = np.where(valid, atlas.area.sum() / valid.sum(), 0.0)
     return Layer(NAME, "irradiance", module.ORDER, position, weight, np.full(len(position), -1))
+
+
+def shown_glow(
+    tracer: Tracer, scene: Scene, atlas: Atlas, irradiance: Float32[np.ndarray, "texels 3"], emitters: Any, seed: int
+) -> Shown | None:
+    """Light of what glows as the lightmaps show it, direct and indirect; None where nothing glosses."""
+    address: dict[str, Any] = {"seed": seed, "stream": "emission probes"}
+    light = irradiance[:, :, None]
+    return Shown.of(tracer, scene, atlas, [()], light, emitters, **address) if any(glossy(scene)) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +122,7 @@ class ProbeBake:
         self,
         split: str,
         indices: Sequence[int],
-        sent: Callable[[int], Sent],
+        sent: Callable[[int], Sent | Shown],
         progress: Progress,
         *,
         dark: bool,
@@ -153,69 +152,85 @@ class ProbeBake:
                         rays = self._rays(source, len(kinds), stage)
                         stage.pace(len(kinds) * rays * int(valid.sum()))
                     light[:, valid] = self._gathered(source, rays, stage)
+                    del source  # before the next half's maps are read
+                if split == "train":
+                    unlit = valid & ~halves[0].any((0, 2, 3))
+                    stage.facts["unlit"] = int(unlit.sum())
+                    name_unlit(self.layer, unlit, progress)
             write_halves(
                 self.dataset.folder, NAME, todo, lambda index: [half[indices.index(index)] for half in halves], self.manifest
             )
             stage.facts["rays"] = self.tracer.rays - before
-        self._name_shut(progress)
+        name_shut(self.layer, progress)
 
     def lacks_constant(self) -> bool:
         """Whether the light of what glows is missing."""
         return not self.manifest.holds(layer_name(NAME, "constant"))
 
-    def constant(self, irradiance: Float32[np.ndarray, "texels 3"], atlas: Atlas, scene: Scene, bounces: int) -> dict[str, Any]:
+    def constant(self, glowing: Any, atlas: Atlas, scene: Scene, bounces: int) -> dict[str, Any]:
         """Bakes the light of what glows, and tells how.
 
         Args:
-          irradiance: of it, direct, on every texel.
+          glowing: of it, on every texel: `ddprt.transport.emission.Constant`.
           atlas, scene, bounces: of the bake.
         """
-        glow, emitters = (import_module(f"ddprt.transport.{name}") for name in ("emission_probes", "emission"))
-        valid, config = self.layer.weight > 0, self.config
+        glow, emission = (import_module(f"ddprt.transport.{name}") for name in ("emission_probes", "emission"))
+        valid, config, emitters = self.layer.weight > 0, self.config, emission.Emitters.of(scene)
         found = glow.probe_light(
-            emitters.Emitters.of(scene),
+            emitters,
             self.tracer,
             atlas,
-            irradiance,
+            glowing.direct,
             self.layer.position[valid],
             config.transport,
             config.probes.rays,
             seed=config.seed,
             bounces=bounces,
+            shown=shown_glow(self.tracer, scene, atlas, glowing.irradiance, emitters, config.seed),
         )
         light = np.zeros((len(valid), self.layer.coefficients, 3), np.float32)
         light[valid] = found.light
         write_light(self.dataset.folder, NAME, "constant", light, self.manifest)
         return dict(found.facts)
 
-    def _rays(self, source: Sent, halves: int, stage: Any) -> int:
+    def _rays(self, source: Sent | Shown, halves: int, stage: Any) -> int:
         """Rays of each probe, as configured or as the noise that is aimed at asks."""
         given = self.config.probes.rays
         if given == "auto":
             position, target = self.layer.position[self.layer.weight > 0], self.config.transport.target_noise
-            radiosity = source.bounced.radiosity
-            rays, noise = self.module.choose_rays(source.operator, radiosity, position, target, halves=halves, **source.address)
+            rays, noise = source.choose_rays(position, target, halves)
             stage.facts["noise_expected"] = float(f"{noise:.3g}")
         else:
             rays = self.module.power_of_two(given)
         stage.facts["samples"] = rays * halves
         return int(rays)
 
-    def _gathered(self, source: Sent, rays: int, stage: Any) -> Float32[np.ndarray, "lightings valid harmonics 3"]:
+    def _gathered(self, source: Sent | Shown, rays: int, stage: Any) -> Float32[np.ndarray, "lightings valid harmonics 3"]:
         position = self.layer.position[self.layer.weight > 0]
         parts = []
-        for part in self.module.gather(source.operator, source.bounced.radiosity, position, rays, **source.address):
+        for part in source.gather(position, rays):
             parts.append(part)
             stage.advance(rays * part.shape[1])
         return np.concatenate(parts, 1)
 
-    def _name_shut(self, progress: Progress) -> None:
-        """Names the probes that are not in free air."""
-        shut = np.flatnonzero(self.layer.weight == 0)
-        if len(shut):
-            told = ", ".join(f"{i} at {np.round(self.layer.position[i], 4).tolist()}" for i in shut[:_NAMED])
-            more = f" and {len(shut) - _NAMED} more" if len(shut) > _NAMED else ""
-            progress.warn(
-                f"probes: {len(shut)} of {len(self.layer.position)} stand inside solids or behind walls, and stay dark: "
-                f"{told}{more}"
-            )
+
+def name_shut(layer: Layer, progress: Progress) -> None:
+    """Names the probes that are not in free air."""
+    shut = layer.weight == 0
+    if shut.any():
+        _name(layer, shut, "stand inside solids or behind walls, and stay dark", progress)
+
+
+def name_unlit(layer: Layer, unlit: Bool[np.ndarray, " places"], progress: Progress) -> None:
+    """Names those in free air that no light of any training lighting reaches."""
+    if unlit.any():
+        way = "move the grid (probes.region_low and region_high), or see that lamps stand where probes do"
+        what = f"get no light under any training lighting, as outside of a closed room; {way}"
+        _name(layer, unlit, what, progress)
+
+
+def _name(layer: Layer, which: Bool[np.ndarray, " places"], what: str, progress: Progress) -> None:
+    found = np.flatnonzero(which)
+    told = ", ".join(f"{i} at {np.round(layer.position[i], 4).tolist()}" for i in found[:_NAMED])
+    more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
+    progress.warn(f"probes: {len(found)} of {len(which)} {what}: {told}{more}")

@@ -13,6 +13,7 @@ import numpy as np
 from ddprt import __version__
 from ddprt.axes import Bool
 from ddprt.dataset.grids import ProbeGrid, nearest_valid
+from ddprt.dataset.layers import Layer
 from ddprt.errors import UserError
 from ddprt.files import write_tensors, write_text
 from ddprt.methods.svd_ridge import LinearTransfer
@@ -119,7 +120,7 @@ def _export(part: LayerModel, covered: Bool[np.ndarray, "height width"], folder:
             "matrix": "1, bases, points * rgb" if colours else "rgb, bases, points",
             **({} if free else {"texel": "places, (row, column) of the lightmap"}),
         },
-        **({"in_solids": np.flatnonzero(layer.weight == 0).tolist()} if free else {}),
+        **({"in_solids": np.flatnonzero(layer.weight == 0).tolist(), "unlit": _unlit(layer, tensors)} if free else {}),
         "unit": "irradiance in W/m2, before albedo" if free else "radiance in W/(m2 sr), of indirect light",
         "decode": [*_TO_HARMONICS, *(_PROBES if free else _SURFACE)],
         "golden": _golden_probes(part) if free else _golden_surface(part),
@@ -134,6 +135,14 @@ def _grid(part: LayerModel) -> list[int] | None:
         return [len(axis) for axis in ProbeGrid.of(part.layer).axes]
     except UserError:
         return None
+
+
+def _unlit(layer: Layer, tensors: dict[str, np.ndarray]) -> list[int]:
+    """Probes in free air that no light has reached."""
+    light = np.abs(tensors["basis"]).sum(axis=(0, *range(2, tensors["basis"].ndim)))
+    for name in {"mean", "constant"} & tensors.keys():
+        light = light + np.abs(tensors[name]).sum(axis=tuple(range(1, tensors[name].ndim)))
+    return np.flatnonzero((layer.weight > 0) & (light == 0)).tolist()
 
 
 def _golden_probes(part: LayerModel) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ddprt.axes import Float32
+from ddprt.axes import Float32, Float64
 from ddprt.catalogue import Catalogue
 from ddprt.compiled import compiled
 from ddprt.errors import UserError, nearest
@@ -87,11 +87,12 @@ def read_hdr(path: Path) -> Float32[np.ndarray, "height width 3"]:
     """Reads a Radiance picture (RGBE, flat or run-length encoded), row 0 at the top.
 
     Mantissas are read with + 0.5, the middle of what they stand for, as by Radiance's own code; readers that leave it out get
-    a brightest channel that is darker by up to 0.4 %. Pixels are divided by all the header's EXPOSURE lines, which tell what
-    they were multiplied with.
+    a brightest channel that is darker by up to 0.4 %. Pixels are divided by all the header's EXPOSURE lines and, channel by
+    channel, by all its COLORCORR lines, which tell what they were multiplied with.
 
     Raises:
-      UserError: not such a picture, not readable, cut short, in another order than rows from the top, or of no valid exposure.
+      UserError: not such a picture, not readable, cut short, in another order than rows from the top, or of no valid exposure
+        or colour correction.
     Reference: Ward, "Real Pixels", Graphics Gems II, 1991: (mantissa + 1/2) / 256 * 2^(exponent - 128), 0 where exponent is 0.
     """
     try:
@@ -106,7 +107,7 @@ def read_hdr(path: Path) -> Float32[np.ndarray, "height width 3"]:
     if len(words) != 4 or words[0] != b"-Y" or words[2] != b"+X" or not (words[1] + words[3]).isdigit():
         shown = size.decode("ascii", "replace")[:40]
         raise UserError(f'{path}: got "{shown}", expected rows from the top ("-Y height +X width"); save it again')
-    exposure = _exposure(path, head)
+    exposure = _factors(path, head, b"EXPOSURE", 1) * _factors(path, head, b"COLORCORR", 3)
     height, width = int(words[1]), int(words[3])
     if not 0 < height <= LARGEST or not 0 < width <= LARGEST:
         raise UserError(f"{path}: got {width} x {height} pixels, expected 1 to {LARGEST} a side; make it smaller")
@@ -120,22 +121,22 @@ def read_hdr(path: Path) -> Float32[np.ndarray, "height width 3"]:
         return np.ascontiguousarray(light.astype(np.float64) / exposure, np.float32)
 
 
-def _exposure(path: Path, head: bytes) -> float:
-    """Product of a Radiance header's EXPOSURE lines; 1 where there is none."""
-    product = 1.0
+def _factors(path: Path, head: bytes, key: bytes, count: int) -> Float64[np.ndarray, " count"]:
+    """Product of a Radiance header's lines of a kind, each of so many numbers; 1 where there is none."""
+    product = np.ones(count)
     for line in head.splitlines():
-        if not line.startswith(b"EXPOSURE="):
+        if not line.startswith(key + b"="):
             continue
-        shown = line[9:].strip().decode("ascii", "replace")[:40]
+        shown = line.partition(b"=")[2].strip().decode("ascii", "replace")[:40]
         try:
-            value = float(shown)
-        except ValueError:
-            value = np.nan
-        product *= value
-        if not 0 < value < np.inf or not 0 < product < np.inf:
-            raise UserError(
-                f'{path}: got "EXPOSURE={shown}", expected finite numbers above 0; mend the header or save it again'
-            )
+            values = np.array(shown.split() or ["none"], np.float64)
+        except ValueError:  # as for no number at all
+            values = np.zeros(count)
+        with np.errstate(over="ignore", under="ignore"):
+            product = product * (values if len(values) == count else 0)
+        if not ((product > 0) & np.isfinite(product) & (values.min() > 0)).all():
+            what = "finite numbers" if count == 1 else f"{count} finite numbers each"
+            raise UserError(f'{path}: got "{key.decode()}={shown}", expected {what} above 0; mend the header or save it again')
     return product
 
 

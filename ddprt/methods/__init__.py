@@ -4,18 +4,20 @@ Enters: scaled and encoded pairs. Leaves: a Relighter. Files, scenes and metrics
 """
 
 from collections.abc import Mapping
-from importlib.metadata import entry_points
 from typing import Any
 
 from pydantic import ValidationError
 
 from ddprt.catalogue import Catalogue
 from ddprt.errors import UserError, nearest
+from ddprt.methods import packages
 from ddprt.methods.autoencoder import Autoencoder
 from ddprt.methods.floors import MeanLightmap, NearestLighting
 from ddprt.methods.light_network import LightNetworks
 from ddprt.methods.method import Method
 from ddprt.methods.mlp import Mlp
+from ddprt.methods.neural_lightmap import NeuralMap
+from ddprt.methods.nonnegative import Nonnegative
 from ddprt.methods.point_set import PointSet
 from ddprt.methods.residual import Residual
 from ddprt.methods.sh_prt import ShPrt
@@ -30,12 +32,31 @@ METHODS: Catalogue[type[Method]] = Catalogue(
         "mlp": Mlp,
         "autoencoder": Autoencoder,
         "residual": Residual,
+        "nonnegative": Nonnegative,
+        "neural-lightmap": NeuralMap,
         "sh-prt": ShPrt,
         "light-network": LightNetworks,
         "point-set": PointSet,
     },
 )
-METHODS.update({point.name: point.load() for point in entry_points(group="ddprt.methods")})
+packages.register(METHODS)
+
+
+def known_methods() -> tuple[str, ...]:
+    """Names of all entries, those of packages that were still being imported when `METHODS` was made among them."""
+    packages.register_postponed(METHODS)
+    return tuple(METHODS)
+
+
+def method_named(name: str) -> type[Method]:
+    """An entry of `METHODS`.
+
+    Raises:
+      UserError: there is none, or it is of another package that had to be left out.
+    """
+    if name not in known_methods() and name in packages.REFUSED:
+        raise UserError(packages.REFUSED[name])
+    return METHODS[name]
 
 
 def make_method(name: str, shared: Mapping[str, Any], own: Mapping[str, Any]) -> Method:
@@ -46,9 +67,9 @@ def make_method(name: str, shared: Mapping[str, Any], own: Mapping[str, Any]) ->
       shared: settings of the [fit] section; each method takes those it knows.
       own: the method's own settings, all of which it must know.
     Raises:
-      UserError: unknown method or setting, wrong type or range.
+      UserError: unknown method or setting, wrong type or range, or a method of another package that had to be left out.
     """
-    method = METHODS[name]
+    method = method_named(name)
     known = method.model_fields
     for setting in own:
         if setting not in known:
@@ -64,4 +85,4 @@ def make_method(name: str, shared: Mapping[str, Any], own: Mapping[str, Any]) ->
         raise UserError(f"methods.settings.{name}.{place}: got {fault['input']!r}, expected: {fault['msg']}") from None
 
 
-__all__ = ["METHODS", "Method", "make_method"]
+__all__ = ["METHODS", "Method", "known_methods", "make_method", "method_named"]

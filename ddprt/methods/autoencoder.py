@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from pydantic import Field
 
 from ddprt.fitting.basis import RANK_CUT, Basis, entry_weights
-from ddprt.methods.learned import Learned, losses, statuses
+from ddprt.methods.learned import Learned, told
 from ddprt.methods.method import Examples, columns, in_memory
 from ddprt.methods.svd_ridge import LinearTransfer, transfer_to
 
@@ -39,8 +39,7 @@ class Autoencoder(Learned):
         trained = self.trained("autoencoder", Subspace(min(self.bases, len(entries))), light, light, key)
         basis = _basis(trained.parameters, _rows(train), entries, self.bases)
         relighter = transfer_to(basis, train, self.ridge)
-        report = relighter.report.noting(*statuses(trained))
-        return replace(relighter, report=replace(report, loss=losses(trained)))
+        return replace(relighter, report=told(relighter.report, trained))
 
 
 class Light(NamedTuple):

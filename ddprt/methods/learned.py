@@ -1,15 +1,16 @@
 """What learned methods share: how they are trained, and coefficients of a basis as what is to be learned."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 from pydantic import Field
 
-from ddprt.methods.method import Examples, Method, grouped
+from ddprt.methods.method import Examples, FitReport, Maps, Method, grouped
 from ddprt.training.loop import Problem, Trained, train
 from ddprt.training.schedule import Schedule
 
@@ -44,9 +45,15 @@ class Learned(Method):
         return train(name, problem, data, held, self.schedule, key)
 
 
+def told(report: FitReport, trained: Trained) -> FitReport:
+    """A report with what came of the training: its losses, and its trouble in words and as a status."""
+    return replace(report, loss=losses(trained), trouble=trained.trouble).noting(*statuses(trained))
+
+
 def losses(trained: Trained) -> tuple[tuple[int, float, float], ...]:
-    """For `FitReport.loss`."""
-    return tuple((entry.step, entry.loss, entry.validation) for entry in trained.history)
+    """For `FitReport.loss`: looks at which both were finite, as JSON knows no other number; `trouble` tells of the last one."""
+    looks = [(entry.step, entry.loss, entry.validation) for entry in trained.history]
+    return tuple(look for look in looks if np.isfinite(look).all())
 
 
 def statuses(trained: Trained) -> tuple[str, ...]:
@@ -78,8 +85,16 @@ class Seen(NamedTuple):
 
     @classmethod
     def of(cls, examples: Examples, groups: int, vectors: Array, entries: Array) -> "Seen":
-        """Projections of all light on basis vectors."""
-        return _seen(groups, examples.frame.values, examples.indirect, examples.scale, vectors, entries)
+        """Projections of all light on basis vectors, a block at a time where it stays on disk."""
+        light = examples.indirect
+        targets = jnp.zeros((examples.frame.values.shape[0], groups, len(vectors)))
+        start = 0
+        for block in light.blocks() if isinstance(light, Maps) else [light]:
+            stop = start + block.shape[1] * (3 // groups)
+            targets = _projected(groups, targets, block, vectors[:, start:stop], entries[start:stop])
+            start = stop
+        inputs, importance = _asked(groups, examples.frame.values, examples.scale)
+        return cls(inputs, targets, importance, jnp.ones(len(vectors)))
 
     @property
     def spread(self) -> Float[Array, " bases"]:
@@ -99,12 +114,14 @@ class Seen(NamedTuple):
 
 
 @partial(jax.jit, static_argnums=0)
-def _seen(groups: int, values: Array, light: Array, scale: Array, vectors: Array, entries: Array) -> Seen:
-    inputs, rows = grouped(values, groups), grouped(light, groups)
-    targets = jnp.matmul(rows * entries, vectors.T, precision="highest")
+def _projected(groups: int, before: Array, light: Array, vectors: Array, entries: Array) -> Array:
+    return before + jnp.matmul(grouped(light, groups) * entries, vectors.T, precision="highest")
+
+
+@partial(jax.jit, static_argnums=0)
+def _asked(groups: int, values: Array, scale: Array) -> tuple[Array, Array]:
     share = (scale[:, :groups] / jnp.maximum(jnp.max(scale), jnp.finfo(jnp.float32).tiny)) ** 2
-    importance = share / jnp.maximum(jnp.mean(share), jnp.finfo(jnp.float32).tiny)
-    return Seen(inputs, targets, importance, jnp.ones(len(vectors)))
+    return grouped(values, groups), share / jnp.maximum(jnp.mean(share), jnp.finfo(jnp.float32).tiny)
 
 
 @dataclass(frozen=True)

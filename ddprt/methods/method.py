@@ -99,7 +99,8 @@ class FitReport:
       leave_one_out: leave-one-out error of the coefficients at the ridge in use.
       singular_values: of the indirect light.
       ridge_path: (ridge, leave-one-out error) of each matrix.
-      loss: (step, training loss, validation loss) of learned methods.
+      loss: (step, training loss, validation loss) of learned methods, where both are finite.
+      trouble: how training went wrong, in words; empty where it did not.
     """
 
     status: str = "ok"
@@ -115,6 +116,7 @@ class FitReport:
     ranks: tuple[int, ...] = ()
     ridge_second: tuple[float, ...] = ()
     leave_one_out: tuple[float, ...] = ()
+    trouble: str = ""
 
     def noting(self, *names: str) -> "FitReport":
         """The same with further statuses; the worst of all leads, whatever the order they were found in."""

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from pydantic import Field
 
 from ddprt.fitting.basis import entry_weights, fit_basis
-from ddprt.methods.learned import Learned, Network, Seen, forward, losses, statuses
+from ddprt.methods.learned import Learned, Network, Seen, forward, told
 from ddprt.methods.method import Examples, FitReport, Frame, array_bytes, as_pytree, columns, found_in, grouped, static
 
 
@@ -53,6 +53,7 @@ class Mlp(Learned):
 
     relighter: ClassVar[type] = Perceptron
     why: ClassVar[str] = "learned: does a nonlinear map beat the ridge on the same basis?"
+    streams: ClassVar[bool] = True
     bases: int = Field(16, ge=1)
     width: int = Field(128, ge=1, le=4096)
     depth: int = Field(2, ge=1, le=16)
@@ -74,7 +75,6 @@ class Mlp(Learned):
             bases=len(spread),
             numerical_rank=basis.rank,
             singular_values=tuple(np.asarray(basis.singular_values).tolist()),
-            loss=losses(trained),
-        ).noting(*found_in(train), basis.status, *statuses(trained))
+        ).noting(*found_in(train), basis.status)
         weights, biases = zip(*trained.parameters, strict=True)
-        return Perceptron(weights, biases, basis.vectors, spread, groups, report)
+        return Perceptron(weights, biases, basis.vectors, spread, groups, told(report, trained))

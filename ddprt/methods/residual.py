@@ -5,7 +5,7 @@ question, since those of the transfer itself are too small; how much of its corr
 lightings, and it is none where that makes them worse. Reference: Wolpert, "Stacked generalization", Neural Networks 1992.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal
 
 import jax
@@ -16,7 +16,7 @@ from pydantic import Field
 
 from ddprt.fitting.basis import Basis, entry_weights, fit_basis
 from ddprt.fitting.selection import decompose, missed
-from ddprt.methods.learned import Learned, Network, Seen, forward, losses, statuses
+from ddprt.methods.learned import Learned, Network, Seen, forward, told
 from ddprt.methods.method import Examples, FitReport, Frame, array_bytes, as_pytree, columns, grouped, measured
 from ddprt.methods.svd_ridge import LinearTransfer, compose, targets, transfer_to
 
@@ -62,6 +62,7 @@ class Residual(Learned):
 
     relighter: ClassVar[type] = Corrected
     why: ClassVar[str] = "learned: is there anything non-linear left that the ridge misses?"
+    streams: ClassVar[bool] = True
     bases: int = Field(16, ge=1)
     ridge: Literal["auto"] | Annotated[float, Field(ge=0)] = "auto"
     width: int = Field(64, ge=1, le=4096)
@@ -83,7 +84,7 @@ class Residual(Learned):
         seen, held = seen.over(seen.spread), held.over(seen.spread)
         trained = self.trained("residual", Network(self.width, self.depth, silent=True), seen, held, key)
         gate = _worth(trained.parameters, held)
-        report = replace(linear.report, loss=losses(trained)).noting(*statuses(trained))
+        report = told(linear.report, trained)
         weights, biases = zip(*trained.parameters, strict=True)
         return Corrected(linear.matrix, linear.basis, weights, biases, seen.size, gate, report)
 

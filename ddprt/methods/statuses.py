@@ -6,7 +6,7 @@ STATUSES = {
     "points, or check that normals point into the room.",
     "diverged": "Training met numbers that are not finite; the weights of the best round before are kept, and training was not "
     "started again. Likely causes: a learning rate too high, or lightings that are bright though hardly any point sees them. "
-    "What to do: lower methods.settings.mlp.learning_rate, or use more points.",
+    "What to do: lower learning_rate of the method in [methods.settings], or use more points.",
     "worse_than_mean": "On the validation lightings this method is worse than the mean lightmap, or hardly better than black. "
     "Likely causes: too few training lightings or steps, or validation lightings unlike the training ones or "
     "in other units. What to do: bake more lightings, train longer, or take another method; do not ship it.",

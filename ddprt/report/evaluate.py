@@ -84,6 +84,7 @@ def evaluate(data: Dataset, models: Mapping[str, Model], fit_seconds: Mapping[st
             "bases": report.bases,
             "status": report.status,
             "remarks": list(report.remarks),
+            "trouble": report.trouble,
         }
     lead, main = next(iter(models.items()))
     report = main.relighter.report

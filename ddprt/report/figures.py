@@ -288,21 +288,43 @@ def budget_bars(budget: Mapping[str, Any]) -> str:
     return _plot("budget", draw)
 
 
-def loss_history(report: FitReport) -> str:
-    """Training and validation loss of a learned method."""
+def loss_history(report: FitReport, seconds: Sequence[float] = (), name: str = "loss") -> str:
+    """Training and validation loss of a learned method over its steps and, where they are known, seconds (above)."""
 
     def draw(axes: Any) -> None:
         steps, train, validation = np.array(report.loss).T
-        axes.semilogy(steps, train, color=SERIES["first"], label="train")
-        axes.semilogy(steps, validation, color=SERIES["second"], label="validation")
-        axes.set(xlabel="step", ylabel="loss")
+        positive = min(train.min(), validation.min()) > 0  # a loss may be a logarithm itself
+        axes.set_yscale("log" if positive else "linear")
+        axes.plot(steps, train, color=SERIES["first"], label="train", marker="." if len(steps) == 1 else None)
+        axes.plot(steps, validation, color=SERIES["second"], label="validation")
+        axes.plot(*(values[np.argmin(validation)] for values in (steps, validation)), "o", color=SERIES["second"])
+        axes.set(xlabel="step", ylabel="loss", xlim=(0, steps[-1]))
         axes.legend(frameon=False)
+        if len(seconds):
+            _clock(axes, np.append(0, steps), np.append(0, seconds))
 
-    return _plot("loss", draw)
+    return _plot(name, draw)
 
 
-def plots(evaluation: Evaluation, reports: Mapping[str, FitReport], main: str) -> dict[str, str]:
-    """Every plot that the data allows, by name."""
+def _clock(axes: Any, steps: np.ndarray, seconds: np.ndarray) -> None:
+    """Seconds along the upper edge; they need not be even in steps, as the first ones wait for what is compiled."""
+    upper = axes.twiny()
+    upper.grid(visible=False)
+    upper.spines["top"].set_visible(True)
+    at = np.linspace(0, steps[-1], 5)
+    upper.set(xlim=axes.get_xlim(), xlabel="seconds")
+    upper.set_xticks(at, [f"{moment:.3g}" for moment in np.interp(at, steps, seconds)])
+    for each in (axes, upper):
+        each.set_position((0.19, 0.15, 0.78, 0.69))
+
+
+def plots(
+    evaluation: Evaluation,
+    reports: Mapping[str, FitReport],
+    main: str,
+    seconds: Mapping[str, Sequence[float]] | None = None,
+) -> dict[str, str]:
+    """Every plot that the data allows, by name; `seconds` are those of `loss_history`, by name of the method."""
     errors = evaluation.truth.errors_per_lighting(evaluation.predicted[main])
     report, found = reports[main], {}
     if report.singular_values:
@@ -317,8 +339,10 @@ def plots(evaluation: Evaluation, reports: Mapping[str, FitReport], main: str) -
         found["spot"] = spot_check(evaluation.spot_check)
         if "variance" in evaluation.spot_check:
             found["zscores"] = z_histogram(evaluation.spot_check)
-    learned = next((entry for entry in reports.values() if entry.loss), None)
-    return found if learned is None else {**found, "loss": loss_history(learned)}
+    for name, entry in reports.items():
+        if entry.loss:
+            found[f"loss of {name}"] = loss_history(entry, (seconds or {}).get(name, ()), f"loss-{name}")
+    return found
 
 
 def _scatter(ground: np.ndarray, places: np.ndarray, colours: Any, size: int) -> bytes:

@@ -25,7 +25,8 @@ def layer_scores(data: Dataset, model: Model) -> dict[str, Any]:
         held-out light is uncertain by, projection_relative_rmse of what the best coefficients on the basis would leave. curve:
         the error of the first 1, 2, 4, ... bases alone, up to all. Where the method has no basis: no projection and no curve.
         seen_relative_rmse, of radiance on surfaces: the same of what eyes see, values in 64 directions before each place's
-        surface, each weighed by its cosine as by its share of a picture; never below 0.
+        surface, each weighed by its cosine as by its share of a picture; never below 0. unlit, of probes: how many in free air
+        get no light, neither in the reference nor of the model.
     """
     return {name: _scores(data, part) for name, part in model.layers.items()}
 
@@ -43,9 +44,10 @@ def _scores(data: Dataset, part: LayerModel) -> dict[str, Any]:
         return float(np.sqrt(square) / mean) if mean > 0 else None
 
     lightings = [data.lightings[index] for index in test]
+    predicted = model.predict(values, lightings=lightings, clamp=False, constant=False)
     found: dict[str, Any] = {
         "places": int((layer.weight > 0).sum()),
-        "relative_rmse": share(model.predict(values, lightings=lightings, clamp=False, constant=False) - reference),
+        "relative_rmse": share(predicted - reference),
         "noise_relative_rmse": share(own.maps("noise", test)),
     }
     if layer.quantity == "radiance" and (layer.texel >= 0).all():
@@ -53,6 +55,9 @@ def _scores(data: Dataset, part: LayerModel) -> dict[str, Any]:
         found["seen_relative_rmse"] = _seen(
             layer, light, reference.reshape(light.shape), data.gbuffer["geometric_normal"][layer.texel]
         )
+    if layer.quantity == "irradiance":
+        light = np.concatenate([reference, predicted]).reshape(-1, *own.covered.shape, 3)
+        found["unlit"] = int(((layer.weight > 0) & ~light.any((0, 2, 3))).sum())
     basis = getattr(model.relighter, "basis", None)
     if basis is None or len(basis) == 0:
         return found

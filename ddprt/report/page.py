@@ -69,6 +69,7 @@ def write_page(
     effect_costs: Mapping[str, Mapping[str, Any]] | None = None,
     command: str = "",
     budget: Mapping[str, Any] | None = None,
+    seconds: Mapping[str, Sequence[float]] | None = None,
 ) -> Path:
     """Writes the report.
 
@@ -84,6 +85,7 @@ def write_page(
       effect_costs: rays, seconds and energy_share by name of the effect, where they are known.
       command: that makes this report again.
       budget: contents of budget.json, where the error was taken apart.
+      seconds: by name of a learned method, since its training began, one for each entry of `FitReport.loss`; where known.
     Returns:
       The path.
     Raises:
@@ -124,8 +126,9 @@ def write_page(
         ),
         columns=[label for label, _ in _METHOD_KEYS.values()],
         methods=method_table(evaluation.metrics["methods"]),
-        plots=figures.plots(evaluation, {name: model.relighter.report for name, model in models.items()}, main)
+        plots=figures.plots(evaluation, {name: model.relighter.report for name, model in models.items()}, main, seconds)
         | ({"budget": figures.budget_bars(budget)} if budget else {}),
+        learned=[name for name, model in models.items() if model.relighter.report.loss],
         budget=budget,
         check=evaluation.spot_check,
         enough=_enough(evaluation.spot_check),
@@ -151,7 +154,7 @@ def warnings(
     scores, count = metrics["methods"], metrics["dark_test_lightings"]
     noise, projection = (metrics["floors"][f"{key}_relative_rmse"] for key in ("noise", "projection"))
     found = [
-        (f"{name}: {remark}", STATUSES.get(remark, "This status has no description."))
+        (f"{name}: {remark}", _explained(remark, score.get("trouble", "")))
         for name, score in scores.items()
         for remark in score.get("remarks") or [score["status"]]
         if remark != "ok"
@@ -178,6 +181,13 @@ def warnings(
             "errors but have no relative error of their own. Their lamps may stand inside a solid or outside the room."
         )
         found.append(("Dark test lightings", text))
+    unlit = sum(layer.get("unlit", 0) for layer in metrics.get("layers", {}).values())
+    if unlit:
+        text = (
+            f"{unlit} in free air get no light under any lighting: outside of a closed room, or where no lamp is. "
+            "Objects there would be black. Move the grid (probes.region_low and region_high)."
+        )
+        found.append(("Probes without light", text))
     trust = metrics.get("trust") or {}
     if (trust.get("flagged_share") or 0) > _OUTSIDE:
         found.append(("Held-out lightings of another kind", STATUSES["extrapolating"]))
@@ -193,6 +203,11 @@ def warnings(
             share = f"at most {most} of the largest direct" if most else "an unbounded share of the largest direct"
             found.append((f"Effect cut short: {effect.name}", f"{effect.why}; {share} irradiance is left out."))
     return [*found, *(("Scene repaired on loading", note) for note in notes)]
+
+
+def _explained(remark: str, trouble: str) -> str:
+    told = f"{trouble[:1].upper()}{trouble[1:]}. " if trouble and remark == "diverged" else ""
+    return told + STATUSES.get(remark, "This status has no description.")
 
 
 def _enough(check: Mapping[str, Any]) -> bool:

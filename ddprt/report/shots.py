@@ -1,7 +1,6 @@
 """Pictures of the scene from given places, under two held-out lightings; see `ddprt.report.scenery`."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,14 +10,13 @@ from ddprt.dataset.layers import Layer, read_light
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.report.evaluate import Evaluation
+from ddprt.report.eyes import NEAREST, Eye, looking
 from ddprt.report.lamps import has_size, on_picture
 from ddprt.report.scenery import Scenery, close_cameras, middle_of_gloss
-from ddprt.report.view import Camera, default_camera, diverging, exposure_for, png, signed_range, tonemap, triple
+from ddprt.report.view import Camera, default_camera, diverging, exposure_for, png, signed_range, tonemap
 from ddprt.runtime.model import Model
 from ddprt.scene.mesh import Scene
 from ddprt.transport.embree import Tracer
-
-Eye = tuple[float, float, float]
 
 
 def cameras(scene: Scene, tracer: Tracer, eyes: Sequence[Eye], layers: Sequence[Layer]) -> list[Camera]:
@@ -35,11 +33,9 @@ def cameras(scene: Scene, tracer: Tracer, eyes: Sequence[Eye], layers: Sequence[
     found, target = [], middle_of_gloss(layers)
     target = scene.centre if target is None else target
     for eye in eyes:
-        away = target - eye
-        if np.linalg.norm(away) < 1e-3 * scene.radius:
+        if np.linalg.norm(target - eye) < NEAREST * scene.radius:
             raise UserError(f"report.views: got {list(eye)}, which is what all of them look at; expected places at a distance")
-        upright = np.linalg.norm(np.cross(away, first.up)) > 1e-3 * np.linalg.norm(away)
-        found.append(replace(first, eye=eye, target=triple(target), up=first.up if upright else (0.0, 0.0, -1.0)))
+        found.append(looking(first, np.array(eye), target))
     return found
 
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ddprt.catalogue import Catalogue
 from ddprt.dataset.layers import Layer
 from ddprt.dataset.store import average_into_points
 from ddprt.errors import UserError
@@ -61,7 +62,7 @@ class Model:
     scene: dict[str, str]
     uv: np.ndarray | None = None
     yardstick: Yardstick | None = None
-    layers: "Mapping[str, LayerModel]" = field(default_factory=dict)
+    layers: "Mapping[str, LayerModel]" = field(default_factory=lambda: Catalogue("layer", {}))
     holes: Holes | None = None
     constant: np.ndarray | None = None
 

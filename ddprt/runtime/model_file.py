@@ -14,11 +14,12 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from ddprt import __version__
+from ddprt.catalogue import Catalogue
 from ddprt.dataset.layers import Layer
 from ddprt.errors import UserError
 from ddprt.files import read_tensors, sha256, write_tensors, write_text
 from ddprt.fitting.encoding import Encoding
-from ddprt.methods import METHODS
+from ddprt.methods import method_named
 from ddprt.methods.method import FitReport
 from ddprt.runtime.model import LayerModel, Model
 from ddprt.runtime.trust import Yardstick
@@ -156,7 +157,7 @@ def load_model(folder: str | Path) -> Model:
         raise UserError(f"{folder}: got model schema {schema}, expected {SCHEMA}; fit it again with this version")
     tensors = read_tensors(folder / "tensors.safetensors")
     try:
-        relighter_type = METHODS[document["method"]].relighter
+        relighter_type = method_named(document["method"]).relighter
         checked = _Document.model_validate(document)
         if checked.tensors_sha256 not in (None, sha256(folder / "tensors.safetensors")):
             raise ValueError("the tensors are not those that were saved: their checksum is another")
@@ -234,7 +235,7 @@ def _assemble(
         document["scene"],
         uv,
         None if checked.trust is None else _yardstick(checked.trust, tensors),
-        {entry.name: _layer_model(entry, tensors, parts[entry.name]) for entry in checked.layers},
+        Catalogue("layer", {entry.name: _layer_model(entry, tensors, parts[entry.name]) for entry in checked.layers}),
         Holes.read(tensors, len(tensors["scene.corners"])),
         constant,
     )

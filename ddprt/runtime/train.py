@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Float32
 from threadpoolctl import threadpool_limits
 
 from ddprt import seeds
+from ddprt.catalogue import Catalogue
 from ddprt.config import Config
 from ddprt.dataset.layers import Layer, LayerData, layers
 from ddprt.dataset.pack import Pack
@@ -22,7 +23,7 @@ from ddprt.errors import UserError
 from ddprt.fitting.encoding import Encoding
 from ddprt.methods import make_method
 from ddprt.methods.floors import MeanLightmap, MeanMap
-from ddprt.methods.method import AsksForLights, Examples, Frame, Maps, Method, Relighter, block_texels, unseen_share
+from ddprt.methods.method import AsksForLights, Examples, FitReport, Frame, Maps, Method, Relighter, block_texels, unseen_share
 from ddprt.methods.statuses import BLIND
 from ddprt.runtime.model import LayerModel, Model
 from ddprt.runtime.trust import Yardstick, calibrated, make_yardstick, outside
@@ -118,6 +119,8 @@ def fit_method(
         part = LayerData.of(data, layer)
         return LayerModel(layer, fit_method(part, config, name, settings, points=points, quantity=quantity, seed=seed))
 
+    of_layers = {} if isinstance(data, LayerData) else {layer.name: of_layer(layer) for layer in layers(data)}
+    relighter = _with_trouble_of(relighter, {key: layer.model.relighter.report for key, layer in of_layers.items()})
     return Model(
         name,
         relighter,
@@ -131,10 +134,20 @@ def fit_method(
         {key: data.description["scene"][key] for key in ("name", "digest")},
         data.uv,
         yardstick,
-        {} if isinstance(data, LayerData) else {layer.name: of_layer(layer) for layer in layers(data)},
+        Catalogue("layer", of_layers),
         None if isinstance(data, LayerData) else data.holes,
         data.constant,
     )
+
+
+def _with_trouble_of(relighter: Relighter, of_layers: Mapping[str, FitReport]) -> Relighter:
+    """What went wrong in training for a layer is told by the model, which is looked at."""
+    troubles = {f"layer {name}": report.trouble for name, report in of_layers.items() if "diverged" in report.remarks}
+    if not troubles:
+        return relighter
+    own = relighter.report
+    told = "; ".join([*filter(None, [own.trouble]), *(f"{name}: {trouble}" for name, trouble in troubles.items())])
+    return replace(relighter, report=replace(own, trouble=told).noting("diverged"))  # type: ignore[type-var]
 
 
 def _judged(relighter: Relighter, encoding: Encoding, train: Examples, validation: Examples) -> tuple[Relighter, Yardstick]:

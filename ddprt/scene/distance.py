@@ -1,10 +1,14 @@
 """Exact distance from points to triangles."""
 
+import math
+
 import numpy as np
 
 from ddprt.axes import Float64
+from ddprt.compiled import compiled
 
 
+@compiled
 def distance_within(
     corners: Float64[np.ndarray, "triangles 3 3"],
     bounds: Float64[np.ndarray, "triangles 2 3"],
@@ -19,27 +23,40 @@ def distance_within(
       point: metres.
       reach: an upper bound that is already known; infinity looks at all.
     """
-    gap = np.maximum(np.maximum(bounds[:, 0] - point, point - bounds[:, 1]), 0)
-    near = np.einsum("nd,nd->n", gap, gap) <= reach**2
-    if not near.any():
-        return reach
-    return min(reach, float(np.sqrt(_squared(corners[near], point).min())))
+    best = reach * reach
+    for triangle in range(len(corners)):
+        gap = 0.0
+        for axis in range(3):
+            outside = max(bounds[triangle, 0, axis] - point[axis], point[axis] - bounds[triangle, 1, axis], 0.0)
+            gap += outside * outside
+        if gap <= best:
+            best = min(best, _squared(corners[triangle], point))
+    return math.sqrt(best)
 
 
-def _squared(corners: Float64[np.ndarray, "n 3 3"], point: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, " n"]:
-    """Squared distances: to the plane where the foot lies inside the triangle, to the nearest edge elsewhere."""
-    a, b, c = np.moveaxis(corners, 1, 0)
-    normal = np.cross(b - a, c - a)
-    length2 = np.einsum("nd,nd->n", normal, normal)
+@compiled
+def _squared(corners: Float64[np.ndarray, "3 3"], point: Float64[np.ndarray, "3"]) -> float:
+    """Squared distance: to the plane where the foot lies inside the triangle, to the nearest edge elsewhere."""
+    normal = _cross(corners[1] - corners[0], corners[2] - corners[0])
+    length2 = _dot(normal, normal)
     inside = length2 > 0
-    nearest = np.full(len(corners), np.inf)
-    for start, end in ((a, b), (b, c), (c, a)):
-        edge, away = end - start, point - start
-        size2 = np.einsum("nd,nd->n", edge, edge)
-        along = np.divide(np.einsum("nd,nd->n", edge, away), size2, out=np.zeros_like(size2), where=size2 > 0)
-        rest = away - np.clip(along, 0, 1)[:, None] * edge
-        nearest = np.minimum(nearest, np.einsum("nd,nd->n", rest, rest))
-        inside &= np.einsum("nd,nd->n", np.cross(edge, away), normal) >= 0
-    height = np.einsum("nd,nd->n", point - a, normal)
-    plane = np.divide(height**2, length2, out=np.full_like(height, np.inf), where=inside)
-    return np.minimum(nearest, plane)
+    nearest = math.inf
+    for first in range(3):
+        edge, away = corners[(first + 1) % 3] - corners[first], point - corners[first]
+        size2 = _dot(edge, edge)
+        along = min(max(_dot(edge, away) / size2, 0.0), 1.0) if size2 > 0 else 0.0
+        rest = away - along * edge
+        nearest = min(nearest, _dot(rest, rest))
+        inside = inside and _dot(_cross(edge, away), normal) >= 0
+    height = _dot(point - corners[0], normal)
+    return min(nearest, height * height / length2) if inside else nearest
+
+
+@compiled
+def _dot(a: Float64[np.ndarray, "3"], b: Float64[np.ndarray, "3"]) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@compiled
+def _cross(a: Float64[np.ndarray, "3"], b: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

@@ -214,6 +214,8 @@ class _Reader:
     def _cutout(self, entry: Any, name: str, alpha: float) -> Cutout | None:
         """Its holes; None where it has none."""
         mode, texture = entry.alphaMode or "OPAQUE", _base(entry).baseColorTexture
+        if mode not in ("OPAQUE", "MASK", "BLEND"):
+            raise self.file.fault(f'got alphaMode "{mode}" of material "{name}", expected OPAQUE, MASK or BLEND; mend it')
         if mode == "OPAQUE":
             return None
         if mode == "BLEND":

@@ -5,7 +5,7 @@ number of steps are data to it, so that a search over them compiles once. A step
 number alone: whoever goes on from a checkpoint goes the very way of whoever was never stopped.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -83,25 +83,34 @@ def train(
     first = of_round(0)
     with journal(name, problem, schedule, key, (first, held)) as log:
         state, history = log.resumed(_begin(problem, schedule.by, first, start_key))
-        trouble, how = "", _How(schedule.round, schedule.dtype, schedule.by)
+        trouble, how = _trouble(history), _How(schedule.round, schedule.dtype, schedule.by)
         for number in range(len(history), schedule.rounds):
-            if schedule.patience and int(state.waited) >= schedule.patience:
+            if trouble or (schedule.patience and int(state.waited) >= schedule.patience):
                 break
             state, seen = _round(problem, how, schedule.numbers, state, of_round(number), held, step_key)
             entry = Entry(int(state.step), *map(float, np.asarray(seen)))
             history.append(entry)
-            trouble = _trouble(entry)
+            trouble = _trouble(history)
             log.add(entry, state, history)
-            if trouble:
-                break
     return Trained(state.best, tuple(history), trouble)
 
 
-def _trouble(entry: Entry) -> str:
-    if np.isfinite((entry.loss, entry.validation, entry.gradient)).all():
+def _trouble(history: Sequence[Entry]) -> str:
+    """What is not finite at the last look, what was seen before it, and which parameters are left; empty where all is well."""
+    if not history or np.isfinite((history[-1].loss, history[-1].validation, history[-1].gradient)).all():
         return ""
-    what = "the loss" if not np.isfinite(entry.loss) else "the gradient" if not np.isfinite(entry.gradient) else "the check"
-    return f"{what} was not finite by step {entry.step}, at a learning rate of {entry.rate:.3g}"
+    entry, earlier = history[-1], history[:-1]
+    names = {"loss": "the loss", "gradient": "the gradient", "validation": "the validation loss"}
+    what = next(words for name, words in names.items() if not np.isfinite(getattr(entry, name)))
+    told = f"{what} was not finite by step {entry.step}, at a learning rate of {entry.rate:.3g}"
+    if earlier:
+        first, last = earlier[0], earlier[-1]
+        told += f"; by step {last.step} the loss was {last.loss:.3g} ({first.loss:.3g} by step {first.step})"
+        told += f" and its gradient had a norm of {last.gradient:.3g}"
+    looks = [look for look in history if np.isfinite(look.validation)]
+    best = min(looks, key=lambda look: look.validation, default=None)
+    kept = f"of step {best.step}, with a validation loss of {best.validation:.3g}" if best else "it began with"
+    return f"{told}; the parameters {kept} are kept"
 
 
 @partial(jax.jit, static_argnums=(0, 1))

@@ -16,6 +16,7 @@ from ddprt.sections import TransportConfig
 from ddprt.transport import probes
 from ddprt.transport.embree import Tracer
 from ddprt.transport.emission import Emitters
+from ddprt.transport.sources import Sent, Shown
 
 _FEW, _MOST = 256, 1 << 14  # samples of each probe and half that tell the noise, and that are taken unasked
 _CALL = 1 << 14  # samples of one call
@@ -47,6 +48,7 @@ def probe_light(
     *,
     seed: int,
     bounces: int = -1,
+    shown: Shown | None = None,
 ) -> Glow:
     """Harmonics of irradiance at probes, direct and all bounces.
 
@@ -58,6 +60,7 @@ def probe_light(
       rays: of each probe, or "auto".
       seed: of all random numbers.
       bounces: of the plan.
+      shown: what bounces, as the lightmaps show it, where something glosses; None takes the operator's senders.
     """
     count = harmonics.count(probes.ORDER)
     dark = np.zeros((len(position), count, 3), np.float32)
@@ -74,20 +77,27 @@ def probe_light(
     facts: dict[str, Any] = {"probe_samples": 2 * samples, "probe_noise": float(f"{_relative(halves):.3g}")}
     if bounces == 0:
         return Glow(direct, direct, facts)
+    source = shown or _sent(emitters, tracer, atlas, irradiance, seed, bounces)
+    if rays == "auto":
+        chosen, _ = source.choose_rays(position, config.target_noise, 1)
+    else:
+        chosen = probes.power_of_two(int(rays))
+    facts["probe_rays"] = chosen
+    gathered = np.concatenate(list(source.gather(position, chosen)), 1)[0]
+    return Glow(direct + gathered, direct, facts)
+
+
+def _sent(
+    emitters: Emitters, tracer: Tracer, atlas: Atlas, irradiance: Float32[np.ndarray, "texels 3"], seed: int, bounces: int
+) -> Sent:
+    """What bounces, on the operator's senders."""
     from ddprt.transport.operator import Operator
 
     operator = Operator.of(tracer, atlas, atlas.resolution)
     address: dict[str, Any] = {"seed": seed, "stream": "emission probes"}
     averaged = operator.averaged(irradiance)
-    radiosity = operator.bounce(averaged, **address, bounces=bounces).radiosity
     near = replace(operator.near([()], averaged, bounces=bounces), shine=emitters.shine)
-    if rays == "auto":
-        chosen, _ = probes.choose_rays(operator, radiosity, position, config.target_noise, halves=1, near=near, **address)
-    else:
-        chosen = probes.power_of_two(int(rays))
-    facts["probe_rays"] = chosen
-    gathered = np.concatenate(list(probes.gather(operator, radiosity, position, chosen, near=near, **address)), 1)[0]
-    return Glow(direct + gathered, direct, facts)
+    return Sent(operator, operator.bounce(averaged, **address, bounces=bounces), {**address, "near": near})
 
 
 def _direct(

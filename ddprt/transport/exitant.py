@@ -28,7 +28,6 @@ from scipy.special import k1
 
 from ddprt import harmonics, seeds, warp
 from ddprt.axes import Float32, Float64, Int, Int32
-from ddprt.compiled import compiled
 from ddprt.scene.atlas import Atlas, SurfaceSampler, weights_at
 from ddprt.scene.material import Gloss
 from ddprt.scene.mesh import Scene
@@ -205,7 +204,7 @@ def _tile(
         worth = ggx.shared(paths.incoming[part], paths.base[part], paths.gloss[part], shared, paths.outgoing, Y)
         alive = np.flatnonzero(paths.incoming[part, 2] > 0)
         for light in lit.arriving(paths.origins[part], directions[part], alive, walk, chance):
-            _add(*light, worth, slot[part], sums)
+            light.add(worth, slot[part], sums)
     return _in_world(sums, slots[:, 0], tracer.frames[slots[:, 1]].astype(np.float64), exits.order)
 
 
@@ -252,26 +251,6 @@ def _in_world(
             found[:, home, degree**2 : (degree + 1) ** 2] += turned[:, slot]
         row += degree + 1
     return found
-
-
-@compiled
-def _add(
-    ray: np.ndarray,
-    row: np.ndarray,
-    factor: np.ndarray,
-    table: np.ndarray,
-    worth: np.ndarray,
-    slot: np.ndarray,
-    sums: np.ndarray,
-) -> None:
-    """Adds what each ray found, times what that is worth to each harmonic, to its slot: all lightings in one go."""
-    for i in range(len(ray)):
-        light, share, own = table[row[i]], worth[ray[i]], sums[slot[ray[i]]]
-        for k in range(len(share)):
-            for channel in range(3):
-                times = np.float64(share[k, channel] * factor[i, channel])
-                for lighting in range(light.shape[1]):
-                    own[k, channel, lighting] += times * light[channel, lighting]
 
 
 def choose_samples(lit: Lit, exits: Exits, *, target: float, seed: int, stream: str) -> tuple[int, float]:

@@ -12,7 +12,7 @@ error of 1 % of the irradiance under any one distribution of light, 9 % at worst
 import hashlib
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -154,17 +154,34 @@ def choose_rays(
       target: relative RMSE of irradiance over the sphere, all probes and lightings together.
       halves: that are averaged.
     """
-    lightings = radiosity.shape[1] // 3
-    some, chosen = (
-        np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
-        for count, most in ((len(position), _PILOTS), (lightings, _LIGHTINGS))
-    )
+    some, chosen = pilots(len(position), radiosity.shape[1] // 3)
     light, near = columns_of(radiosity, chosen), near.some(chosen) if near else None
 
     def run(rays: int, turn: int) -> np.ndarray:
         parts = gather(operator, light, position[some], rays, seed=seed, stream=f"{stream} probe pilot {turn}", near=near)
         return np.concatenate(list(parts), 1).astype(np.float64)
 
+    return rays_for(run, target, halves)
+
+
+def pilots(places: int, lightings: int) -> tuple[Int[np.ndarray, " places"], Int[np.ndarray, " lightings"]]:
+    """Probes and lightings that stand for all where rays are chosen."""
+    probes, chosen = (
+        np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
+        for count, most in ((places, _PILOTS), (lightings, _LIGHTINGS))
+    )
+    return probes, chosen
+
+
+def rays_for(
+    run: Callable[[int, int], Float64[np.ndarray, "lightings some harmonics 3"]], target: float, halves: int
+) -> tuple[int, float]:
+    """Rays of each probe (of each half) that reach a noise, and the noise that they will leave.
+
+    Args:
+      run: light of some probes by so many rays, for a turn that has random numbers of its own.
+      target, halves: see `choose_rays`.
+    """
     runs = {rays: (run(rays, 0), run(rays, 1)) for rays in (_FEW, _MANY)}
     mean = float(np.mean([part[:, :, 0].mean() for part in runs[_MANY]])) / _BAND
     if mean <= 0:

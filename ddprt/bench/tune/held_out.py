@@ -2,24 +2,36 @@
 
 A pooled error is a mean of squares over lightings, most of which a few of them may make up: lamps close to a wall, or seen
 through a door. Where that is so, the error on few held-out lightings is mostly too small, and now and then much too large.
+Those that come to them are therefore drawn where errors are likely to be large (`ddprt.bench.tune.suspects`), and as long as
+there are none of these, a lighting worse than all is reckoned with.
 """
 
 import json
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
 from ddprt import seeds
+from ddprt.axes import Float64
 from ddprt.bench.measure.trial import Workshop, measured_here
 from ddprt.bench.measure.trial import environment as here
 from ddprt.bench.measure.yardstick import Yardstick, make_yardstick
+from ddprt.bench.tune.suspects import Suspects, balanced, draw_candidates
+from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
-from ddprt.files import write_text
+from ddprt.files import make_folder, write_text
+from ddprt.lights import Lighting, lighting_json, parse_lighting
 from ddprt.report.metrics import Tally
 from ddprt.runtime.model import Model
 
+Fitted = Callable[[], tuple[Model, Dataset]]
+"""Gives a model, and the dataset that it was fitted to."""
+_LISTED = "lightings.json"
 _TOLD = "took.json"  # seconds of a bake, beside its dataset
+_WORSE = 2.0  # times the largest squared error, of one more lighting that is reckoned with; measured in docs/tuning.md
 _SHARE = 0.1  # noise of more held-out maps over the limit of the error: adds 0.5 % to an error that is at the limit
 
 
@@ -30,13 +42,15 @@ class HeldOut:
     Args:
       workshop: whose yardstick is the first.
     Attributes:
-      seconds: that baking more lightings took.
+      seconds: that drawing and baking more lightings took.
     """
 
     workshop: Workshop
     seconds: float = field(default=0.0, init=False)
     _more: list[Yardstick] = field(default_factory=list, init=False)
     _each: float = field(default=0.0, init=False)
+    _suspects: Suspects | None = field(default=None, init=False)
+    _drawn: list[np.ndarray] = field(default_factory=list, init=False)
 
     @property
     def count(self) -> int:
@@ -44,13 +58,31 @@ class HeldOut:
         return sum(len(yardstick.held_out) for yardstick in (self.workshop.yardstick, *self._more))
 
     def tally(self, model: Model) -> Tally:
-        """Errors of a model under all of them."""
-        return Tally.joined([yardstick.tally(model) for yardstick in (self.workshop.yardstick, *self._more)])
+        """Errors of a model under all of them, each lighting weighed so that means are those over the configuration's."""
+        found = Tally.joined([yardstick.tally(model) for yardstick in (self.workshop.yardstick, *self._more)])
+        if self._suspects is None:
+            return found
+        even = self.workshop.yardstick.measured(self._suspects.model)[: len(self.workshop.yardstick.held_out)]
+        return balanced(found, np.concatenate([self._suspects.density_of(even), *self._drawn]), len(even))
 
-    def more(self, limit: float, allowance: float, times: int = 2) -> bool:
+    def spread(self, tally: Tally) -> tuple[float, float]:
+        """How far off the logarithm of the relative RMSE is, and how skewed: see `spread_of`.
+
+        Lightings drawn at random are reckoned to lack one that is worse than all of them.
+        """
+        if self._suspects is None:
+            return spread_of(tally, worse=_WORSE)
+        spread, skew = spread_of(tally)
+        whole = float(np.hypot(spread, self._suspects.spread))
+        # Third moments add up, and that of a mean of many candidates is small.
+        return whole, skew * (spread / whole) ** 3 if whole else 0.0
+
+    def more(self, fitted: Fitted, limit: float, allowance: float, times: int = 2) -> bool:
         """Draws some more, where that is possible and costs no more than is allowed.
 
         Args:
+          fitted: gives a model and what it was fitted to, whose errors the lightings are drawn for the first time; later ones
+            are drawn for the same, so that what each counts for stays.
           limit: the error that is to be told from what is beyond it; held-out maps are baked as finely as that takes.
           allowance: seconds that more lightings may take, all in all. Those drawn first are never too dear, since what they
             take is not known yet; after that a lighting is expected to take as long as one did the last time.
@@ -61,24 +93,54 @@ class HeldOut:
         config, count = self.workshop.config, (times - 1) * self.count
         if config.lightings.file or (self._more and self.seconds + count * self._each > allowance):
             return False
+        scene, progress = self.workshop.scene, self.workshop.progress
+        suspects = self._suspects or Suspects.of(*fitted(), self._candidates())
         noise = max(config.bench.noise, float(f"{min(1.0, _SHARE * limit):.1g}"))
+        lightings, density = suspects.draw(count, seeds.number(config.seed, "more held-out lightings", len(self._more)))
+        folder = self.workshop.folder / f"truth-{self.workshop.truth}-{suspects.digest}-{len(self._more)}-{count}-{noise:g}"
+        make_folder(folder)
+        listed = folder / _LISTED
+        _write(listed, [*suspects.lightings[:2], *lightings])  # one to train on and one to validate, which nobody uses
+        told = {"file": str(listed), "train": 1, "validation": 1, "test": count, "choose": "random", "target_error": 0.0}
         changes = {
-            "seed": seeds.number(config.seed, "more held-out lightings", len(self._more)),
-            "lightings": config.lightings.model_copy(update={"test": count}),
+            "lightings": config.lightings.model_copy(update=told),
             "bench": config.bench.model_copy(update={"noise": noise, "path_frames": 0, "pictures": 0}),
         }
-        folder = self.workshop.folder / f"truth-{self.workshop.truth}-{len(self._more)}-{count}-{noise:g}"
-        self.workshop.progress.say(f"{count} more held-out lightings, to tell whether the error is within its limit")
+        progress.say(f"{count} more held-out lightings, to tell whether the error is within its limit")
         begun = time.perf_counter()
-        found = make_yardstick(self.workshop.scene, config.model_copy(update=changes), folder, self.workshop.progress)
-        took, told = time.perf_counter() - begun, folder / _TOLD
-        if told.is_file() and measured_here((before := json.loads(told.read_text("utf-8")))["environment"]):
-            took = before["seconds"]  # of when it was baked
-        else:
-            write_text(told, json.dumps({"seconds": round(took, 4), "environment": here()}) + "\n")
+        found = make_yardstick(scene, config.model_copy(update=changes), folder / "maps", progress)
+        took = _took(folder, time.perf_counter() - begun)
+        self._suspects = suspects
+        self._drawn.append(density)
         self._more.append(found)
         self.seconds, self._each = self.seconds + took, took / count
         return True
+
+    def _candidates(self) -> list[Lighting]:
+        """Lightings to draw from, as they were drawn before or now; what that took is counted in."""
+        folder = self.workshop.folder / f"truth-{self.workshop.truth}-candidates"
+        listed, begun = folder / _LISTED, time.perf_counter()
+        if listed.is_file():
+            found = [parse_lighting(each) for each in json.loads(listed.read_text("utf-8"))]
+        else:
+            found = draw_candidates(self.workshop.scene, self.workshop.config)
+            make_folder(folder)
+            _write(listed, found)
+        self.seconds += _took(folder, time.perf_counter() - begun)
+        return found
+
+
+def _write(path: Path, lightings: Sequence[Lighting]) -> None:
+    write_text(path, json.dumps([lighting_json(lighting) for lighting in lightings]) + "\n")
+
+
+def _took(folder: Path, now: float) -> float:
+    """Seconds that what lies in a folder took: as it was made here before, else now, which is noted."""
+    path = folder / _TOLD
+    if path.is_file() and measured_here((before := json.loads(path.read_text("utf-8")))["environment"]):
+        return float(before["seconds"])
+    write_text(path, json.dumps({"seconds": round(now, 4), "environment": here()}) + "\n")
+    return now
 
 
 def error_of(tally: Tally) -> float:
@@ -93,17 +155,31 @@ def error_of(tally: Tally) -> float:
     return float(error)
 
 
-def spread_of(tally: Tally) -> tuple[float, float]:
+def spread_of(tally: Tally, worse: float = 0.0) -> tuple[float, float]:
     """How far off the logarithm of the relative RMSE is on held-out lightings, by leaving each out (the jackknife).
 
+    Args:
+      tally: of the lightings.
+      worse: times the largest squared error, of one more lighting as bright as that one, which moments are taken with where
+        that widens the spread, and the error itself is not; 0 for none. Of few lightings out of many that differ, the moments
+        lack what the error lacks.
     Returns:
       Its standard error, and its skewness: that of the values that stand for the lightings, over the root of their number.
     """
-    count = len(tally.error)
-    if count < 2 or not tally.error.any():
+    error, means = tally.error, tally.mean.mean(1)
+    if len(error) < 2 or not error.any():
         return 1.0, 0.0
-    means = tally.mean.mean(1)
-    others = (tally.error.sum() - tally.error) / (count - 1), (means.sum() - means) / (count - 1)
+    found = _jackknife(error, means)
+    if worse:
+        most = int(error.argmax())
+        found = max(found, _jackknife(np.append(error, worse * error[most]), np.append(means, means[most])))
+    return found
+
+
+def _jackknife(error: Float64[np.ndarray, " lightings"], means: Float64[np.ndarray, " lightings"]) -> tuple[float, float]:
+    """Spread and skew of half the logarithm of the mean of the first, less that of the second's."""
+    count = len(error)
+    others = (error.sum() - error) / (count - 1), (means.sum() - means) / (count - 1)
     logs = 0.5 * np.log(np.maximum(others[0], 1e-300)) - np.log(np.maximum(others[1], 1e-300))
     values = logs.mean() - logs  # what is larger without a lighting is smaller with it
     square = float(np.mean(values**2))

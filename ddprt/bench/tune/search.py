@@ -13,7 +13,7 @@ from ddprt.bench.measure.settings import Setting, changed
 from ddprt.bench.measure.timing import timed
 from ddprt.bench.measure.trial import Workshop, about, environment, why
 from ddprt.bench.tune.curves import first_bases, time_of_frame, with_measured, without_last
-from ddprt.bench.tune.held_out import HeldOut, error_of, spread_of
+from ddprt.bench.tune.held_out import HeldOut, error_of
 from ddprt.bench.tune.knobs import FACTORS, around, value_of
 from ddprt.bench.tune.outcome import UNITS, Doubt, Outcome
 from ddprt.bench.tune.planner import HOPELESS, KNOBS, QUANTITIES, SURE, Place, Plan, Planner, Trial, seconds
@@ -165,7 +165,14 @@ class Search:
             return False
         tried = sum(map(seconds, planner.trials))
         left = self._allowed() - tried
-        if left <= 0 or not self.held_out.more(self.limits["relative_rmse"], min(_LIGHTINGS * tried, left), times):
+        allowed = min(_LIGHTINGS * tried, left)
+
+        def fitted() -> tuple[Model, Dataset]:
+            setting = self.setting(plan)
+            data, _ = self.workshop.bake(setting)
+            return self._fit(setting, data)[0], data
+
+        if left <= 0 or not self.held_out.more(fitted, self.limits["relative_rmse"], allowed, times):
             return False
         for trial in planner.trials:
             planner.replace(self.scored_again(trial))
@@ -251,7 +258,7 @@ class Search:
         """Errors at so many bases, and how sure that of the most is."""
         most = model.relighter.report.bases
         tallies = [self.held_out.tally(stored(without_last(model, most - count), "half")) for count in sizes]
-        return tuple(map(error_of, tallies)), *spread_of(tallies[-1])
+        return tuple(map(error_of, tallies)), *self.held_out.spread(tallies[-1])
 
     def scored_again(self, trial: Trial) -> Trial:
         """The same with its errors on all held-out lightings there are now."""
@@ -280,7 +287,7 @@ class Search:
             "fit_seconds": fitted,
         }
         self.planner.trials.remove(known)
-        self.planner.add(with_measured(known, plan, reached, *spread_of(tally), off))
+        self.planner.add(with_measured(known, plan, reached, *self.held_out.spread(tally), off))
         return reached
 
     def _fit(self, setting: Setting, data: Dataset) -> tuple[Model, float]:
