@@ -29,7 +29,7 @@ from ddprt.errors import UserError
 from ddprt.fitting.basis import Basis, entry_weights, fit_basis
 from ddprt.fitting.selection import Choice, choose_ridge, decompose
 from ddprt.fitting.transfer import Transfer, solve_transfer
-from ddprt.methods.learned import Learned, Seen, losses, statuses
+from ddprt.methods.learned import Learned, Seen, told
 from ddprt.methods.method import Examples, FitReport, Frame, array_bytes, as_pytree, columns, found_in, static
 from ddprt.methods.svd_ridge import compose
 
@@ -295,7 +295,7 @@ class LightNetworks(Learned):
         gains = problem.check(trained.parameters, known) < problem.check(begun, known)
         best = trained.parameters if bool(gains) else begun
         outputs = jnp.asarray(np.asarray(best.outputs, np.float64) * spread, jnp.float32)
-        report = replace(report, loss=losses(trained)).noting(*statuses(trained))
+        report = told(report, trained)
         return LightNetwork(best.frequencies, best.phases, outputs, basis.vectors, *place, groups, report)
 
     def _start(self, lit: Lit, key: Array) -> tuple[Cosines, FitReport]:

@@ -17,7 +17,7 @@ The network learns, with points dropped at random, what transfers miss that have
 it is taken is decided on validation lightings, once for all points and once for fewer; it is none where it makes them worse.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import jax
@@ -28,7 +28,7 @@ from pydantic import Field
 
 from ddprt.fitting.basis import Basis, entry_weights, fit_basis
 from ddprt.fitting.selection import RANK_CUT
-from ddprt.methods.learned import Layers, Learned, Network, Seen, forward, losses, statuses
+from ddprt.methods.learned import Layers, Learned, Network, Seen, forward
 from ddprt.methods.method import Examples, FitReport, Frame, array_bytes, as_pytree, columns, grouped, measured
 from ddprt.methods.svd_ridge import compose, targets, transfer_to
 
@@ -219,17 +219,17 @@ class PointSet(Learned):
         seen, held = (Seen.of(part, groups, basis.vectors, entries) for part in (train, validation))
         fold = np.arange(len(train.scale)) % _FOLDS
         parts = [np.flatnonzero(fold != number) if len(fold) > 1 else np.arange(1) for number in range(_FOLDS)]
-        told = jnp.stack([_features(seen.inputs, part, points, self.latent) for part in parts])
+        apart = jnp.stack([_features(seen.inputs, part, points, self.latent) for part in parts])
         own = _features(seen.inputs, np.arange(len(fold)), points, self.latent)
         unseen = _unseen(basis, train, whole.report.ridge, parts)
-        tried = [_sets(told, unseen, noise, seen, masks) for noise in _NOISES]
+        tried = [_sets(apart, unseen, noise, seen, masks) for noise in _NOISES]
         best = int(np.argmin([_missing(sets) for sets in tried]))
         sets, known = tried[best], _sets(own[None], whole.matrix[None], _NOISES[best], held, few)
         size = sets.spread
         sets, known = sets.over(size), known.over(size)
         network = Network(self.width, self.depth, silent=True)
         trained = self.trained("point-set", SomePoints(network), sets, known, step)
-        report = replace(whole.report, loss=losses(trained)).noting(*statuses(trained))
+        report = told(whole.report, trained)
         weights, biases = zip(*trained.parameters, strict=True)
         noise, gates = jnp.float32(_NOISES[best]), _worth(trained.parameters, known)
         return SetEncoder(whole.matrix, whole.basis, *at, own, noise, weights, biases, size, gates, report)
