@@ -28,7 +28,7 @@ from pydantic import Field
 
 from ddprt.fitting.basis import Basis, entry_weights, fit_basis
 from ddprt.fitting.selection import RANK_CUT
-from ddprt.methods.learned import Layers, Learned, Network, Seen, forward
+from ddprt.methods.learned import Layers, Learned, Network, Seen, forward, told
 from ddprt.methods.method import Examples, FitReport, Frame, array_bytes, as_pytree, columns, grouped, measured
 from ddprt.methods.svd_ridge import compose, targets, transfer_to
 
