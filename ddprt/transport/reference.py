@@ -20,6 +20,7 @@ from ddprt.transport.direct import centred, direct_irradiance
 from ddprt.transport.embree import Tracer, lifted
 from ddprt.transport.glossiness import glossy_surfaces
 from ddprt.transport.hairiness import refuse_hairy
+from ddprt.transport.translucency import refuse_filled
 
 _BATCH = 1 << 15  # paths traced together
 _MAX_SURVIVAL = 0.999  # a white closed room would never let a path go; a lower cap has no finite variance above its root
@@ -61,6 +62,7 @@ def trace_reference(
       bounces: -1 follows every path to its end by roulette; otherwise at most this many.
     """
     refuse_hairy(scene, "the reference", "use transport.trace_paths,")
+    refuse_filled(scene, "unbiased paths")
     lights, gloss = centred(tracer, lighting), glossy_surfaces(tracer, scene)
     block = max(1, _BATCH // samples)
     rounds = -(-samples // _BATCH)
