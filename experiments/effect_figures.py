@@ -7,6 +7,7 @@ sampled, the mean square root of what their samples leave uncertain, relative as
 import math
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from ddprt.lights import parse_lighting
 from ddprt.scene.atlas import build_atlas
 from ddprt.scene.checks import checked
 from ddprt.scene.exr import write_exr
+from ddprt.scene.library import build
 from ddprt.scene.material import Cutout, Emission, Gloss, Material
 from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import faceted, icosphere, rectangle
@@ -241,6 +243,41 @@ def probes(quick: bool) -> Figure:
     return compared(found, expected, noise, unit=expected[0, 0])
 
 
+def hair(quick: bool) -> Figure:
+    """White fur under a white sky of radiance 1: pi leaves every fibre, of which what the sky sends there straight is direct.
+
+    The sum over all texels; its error is that of eight runs.
+    """
+    from ddprt.transport.gather import Receivers
+    from ddprt.transport.hair import Hair
+    from ddprt.transport.openness import build_open_atlas
+    from ddprt.transport.paths import trace_paths
+    from ddprt.transport.walk import starts
+
+    fur = build("furball", strands=100, subdivisions=1)
+    assert fur.tubes is not None
+    fur = replace(fur, tubes=replace(fur.tubes, colour=np.ones_like(fur.tubes.colour)))
+    fur = fur.made_of(lambda material: replace(material, albedo=(1.0,) * 3))
+    tracer = Tracer.of(fur, 2)
+    atlas, _ = build_open_atlas(tracer, fur, 48)
+    strands, samples, runs = Hair.of(tracer, fur), 64 if quick else 1024, []
+    with tempfile.TemporaryDirectory() as folder:
+        write_exr(Path(folder) / "white.exr", np.ones((4, 8, 3), np.float32))
+        sky = parse_lighting({"type": "environment", "image": str(Path(folder) / "white.exr")})
+        for run in range(8):
+            light = np.zeros((1, atlas.count, 3), np.float32)
+            for _ in trace_paths(tracer, fur, atlas, [sky], light, samples=samples, seed=0, stream=f"run {run}"):
+                pass
+            straight, receivers = 0.0, Receivers.texels(atlas, samples, 0, f"run {run} paths")
+            for tile in receivers.tiles():
+                for (origins, directions, owner), triangle in starts(tracer, receivers, tile):
+                    weight = strands.begun(origins, directions, triangle)[0]
+                    escaped = tracer.first(origins, directions)[0] < 0
+                    straight += float(weight[escaped] @ atlas.area[tile][owner[escaped]]) / samples
+            runs.append((light[0, :, 0].astype(float) @ atlas.area / np.pi + straight) / atlas.area.sum())
+    return compared(np.mean(runs), 1.0, np.std(runs, ddof=1) / math.sqrt(len(runs)))
+
+
 FIGURES: dict[str, Callable[[bool], Figure]] = {
     "diffuse bounces": bounces,
     "point lights": point,
@@ -254,6 +291,7 @@ FIGURES: dict[str, Callable[[bool], Figure]] = {
     "cut-outs": cutouts,
     "two-sided sheets": two_sided,
     "emission": emission,
+    "hair": hair,
     "probes": probes,
 }
 """What tells of each effect that it is right. A new effect is one entry more, or the experiment and its test fail."""
