@@ -36,6 +36,7 @@ from ddprt.transport.embree import Tracer
 from ddprt.transport.glossiness import scattering
 from ddprt.transport.measure import measure
 from ddprt.transport.openness import build_open_atlas
+from ddprt.transport.translucency import filled, refuse_filled
 
 DEPTH = 0.75  # of the distance between samples: what they mistake for a constant shrinks to 1.8 %
 _NAMED = 8  # doubtful lightings, or altered files, that a message spells out
@@ -181,6 +182,8 @@ class _Bake:
         description = self._description(entries, effects, drawn, samples)
         bounces = next(effect for effect in effects.effects if effect.name == "diffuse bounces")
         operator = description["transport"]["integrator"] == "operator"  # which tells what it left out, if anything
+        if not operator or effects.called("emission"):
+            refuse_filled(self.scene, "transport.integrator" if not effects.called("emission") else "emission")
         if bounces.bound is None and not bounces.forced and not operator:  # what else has no bound stands in the plan
             self.progress.warn(f"{bounces.name}: {bounces.why}")
         if there is None:
@@ -217,6 +220,7 @@ class _Bake:
             "ddprt": __version__,
             **{key: value for key, value in baked_settings(self.config, self.scene).items() if value != []},
             "quantity": "irradiance",
+            **({"exitant": exitant} if (exitant := self._exitant()) else {}),
             "unit": "W/m2",
             "points": self._points(samples),
             "plan": [asdict(effect) for effect in effects.effects],
@@ -224,6 +228,10 @@ class _Bake:
             "lightings": _records(entries),
             **({"skies": skies} if (skies := pictures([lighting for _, lighting in entries])) else {}),
         }
+
+    def _exitant(self) -> list[str]:
+        """Materials whose texels hold what leaves them, W/m² before albedo, instead of the irradiance."""
+        return [entry.name for entry, inside in zip(self.scene.materials, filled(self.scene), strict=True) if inside]
 
     def _points(self, samples: Samples) -> dict[str, Any]:
         return {"count": self.config.points.count, "digest": samples.digest}
