@@ -13,7 +13,8 @@ from ddprt.bench.measure.settings import Setting
 from ddprt.bench.measure.trial import Workshop
 from ddprt.bench.measure.yardstick import Yardstick
 from ddprt.bench.tune import held_out as module
-from ddprt.bench.tune.held_out import Fitted, HeldOut, error_of, spread_of
+from ddprt.bench.tune.fitted import Fitted
+from ddprt.bench.tune.held_out import HeldOut, error_of, spread_of
 from ddprt.bench.tune.planner import Plan, Planner
 from ddprt.bench.tune.search import Search
 from ddprt.bench.tune.suspects import draw_candidates, unknown
@@ -41,7 +42,7 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Workshop:
 def fitted(workshop: Workshop) -> Fitted:
     data, _ = workshop.bake(Setting({}, base()))
     model = fit_config(data, base(), "svd-ridge")
-    return lambda: (model, data)
+    return Fitted(model, data, {}, 0.0)
 
 
 def drawn(held_out: HeldOut) -> list[str]:
@@ -53,8 +54,8 @@ def test_each_time_there_are_more_of_the_same_density(workshop: Workshop, fitted
     held_out = HeldOut(workshop)
     assert held_out.count == 4
     first = drawn(held_out)
-    assert held_out.more(fitted, 0.5, 0.0), "the first doubling is never too dear"
-    assert not held_out.more(fitted, 0.5, 0.0), "the second is"
+    assert held_out.more(lambda: fitted, 0.5, 0.0), "the first doubling is never too dear"
+    assert not held_out.more(lambda: fitted, 0.5, 0.0), "the second is"
     assert held_out.count == 8
     assert held_out.more(lambda: pytest.fail("drawn for another model"), 0.5, 1e9, 3)
     assert held_out.count == 24
@@ -63,7 +64,7 @@ def test_each_time_there_are_more_of_the_same_density(workshop: Workshop, fitted
     candidates = json.loads(next(workshop.folder.glob("truth-*-candidates/lightings.json")).read_text())
     assert {*drawn(held_out)[4:]} < {repr(parse_lighting(each)) for each in candidates}
     again = HeldOut(workshop)
-    assert again.more(fitted, 0.5, 0.0)
+    assert again.more(lambda: fitted, 0.5, 0.0)
     assert drawn(again) == drawn(held_out)[:8]
     took = [
         json.loads(next(workshop.folder.glob(f"truth-*-{what}/took.json")).read_text())["seconds"]
@@ -83,16 +84,16 @@ def test_their_maps_are_as_fine_as_a_tenth_of_the_limit_asks(
 
     monkeypatch.setattr(module, "make_yardstick", note)
     for limit, noise in ((0.5, 0.3), (4.0, 0.4), (100.0, 1.0)):  # the configuration's is 0.3
-        assert HeldOut(workshop).more(fitted, limit, 0.0)
+        assert HeldOut(workshop).more(lambda: fitted, limit, 0.0)
         assert asked[-1].bench.noise == noise
 
 
 def test_errors_are_pooled_over_all_of_them_by_what_each_counts_for(workshop: Workshop, fitted: Fitted) -> None:
-    model, data = fitted()
+    model, data = fitted.model, fitted.data
     held_out = HeldOut(workshop)
     few = held_out.tally(model)
     assert held_out.spread(few) == spread_of(few, 2.0)
-    held_out.more(fitted, 0.5, 0.0)
+    held_out.more(lambda: fitted, 0.5, 0.0)
     tally, other = held_out.tally(model), held_out._more[0].tally(model)
     # Four drawn evenly and four by a density: each counts 8 / (4 + 4 d), d by what the model's own points measure.
     candidates = [parse_lighting(each) for each in json.loads(next(workshop.folder.glob("*-candidates/*s.json")).read_text())]
