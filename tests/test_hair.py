@@ -16,7 +16,7 @@ from ddprt.scene.library import build
 from ddprt.scene.material import Emission, Gloss, Material
 from ddprt.scene.mesh import Scene
 from ddprt.scene.tubes import TEXELS, bald, with_strands
-from ddprt.transport import fibre
+from ddprt.transport import fibre, hair
 from ddprt.transport.effects import force, plan
 from ddprt.transport.embree import Tracer
 from ddprt.transport.gather import Receivers
@@ -57,12 +57,12 @@ def test_white_fur_under_a_white_sky_is_as_bright_as_the_sky(fur: Scene, tmp_pat
     write_exr(tmp_path / "white.exr", np.ones((4, 8, 3), np.float32))
     samples = 512
     out, atlas, tracer = traced(scene, [{"type": "environment", "image": str(tmp_path / "white.exr")}], samples)
-    hair = Hair.of(tracer, scene)
+    strands = Hair.of(tracer, scene)
     receivers = Receivers.texels(atlas, samples, 0, "test paths")  # the very first rays of the bake
     straight = np.zeros(atlas.count)
     for tile in receivers.tiles():
         for (origins, directions, owner), triangle in starts(tracer, receivers, tile):
-            weight = hair.begun(origins, directions, triangle)[0]
+            weight = strands.begun(origins, directions, triangle)[0]
             escaped = tracer.first(origins, directions)[0] < 0
             np.add.at(straight, tile.start + owner[escaped], weight[escaped] / samples)
     total = out[0, :, 0] / np.pi + straight
@@ -118,11 +118,14 @@ def test_forward_light_is_coloured_by_what_it_passes(fur: Scene) -> None:
     assert atlas.count > 60 * TEXELS
 
 
-def test_forced_bounces_are_a_beginning(fur: Scene) -> None:
+def test_forced_bounces_are_a_beginning(fur: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     # Means of the strands are 0.0426, 0.0481 and 0.0487 with standard errors of 0.0006 (512 paths, four streams).
     one, two, more = (traced(white(fur), [SUN], 512, bounces=count)[0][0, -60 * TEXELS :].mean() for count in (1, 2, -1))
     assert 0.04 < one < 0.045 < two < 0.051
     assert abs(more - 0.0487) < 0.0025
+    monkeypatch.setattr(hair, "SURVIVAL", 0.4)  # what goes on less often weighs the more: unweighed 0.0036 would be lost
+    rarely = traced(white(fur), [SUN], 512)[0][0, -60 * TEXELS :].mean()
+    assert abs(rarely - 0.0487) < 0.0025
 
 
 def test_the_plan_names_strands_and_off_makes_them_diffuse(fur: Scene, cornell: Scene) -> None:
