@@ -16,7 +16,7 @@ from ddprt.scene.library import build
 from ddprt.scene.material import Emission, Gloss, Material
 from ddprt.scene.mesh import Scene
 from ddprt.scene.tubes import TEXELS, bald, with_strands
-from ddprt.transport import fibre, hair
+from ddprt.transport import fibre
 from ddprt.transport.effects import force, plan
 from ddprt.transport.embree import Tracer
 from ddprt.transport.gather import Receivers
@@ -118,14 +118,26 @@ def test_forward_light_is_coloured_by_what_it_passes(fur: Scene) -> None:
     assert atlas.count > 60 * TEXELS
 
 
-def test_forced_bounces_are_a_beginning(fur: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_forced_bounces_are_a_beginning(fur: Scene) -> None:
     # Means of the strands are 0.0426, 0.0481 and 0.0487 with standard errors of 0.0006 (512 paths, four streams).
     one, two, more = (traced(white(fur), [SUN], 512, bounces=count)[0][0, -60 * TEXELS :].mean() for count in (1, 2, -1))
     assert 0.04 < one < 0.045 < two < 0.051
     assert abs(more - 0.0487) < 0.0025
-    monkeypatch.setattr(hair, "SURVIVAL", 0.4)  # what goes on less often weighs the more: unweighed 0.0036 would be lost
-    rarely = traced(white(fur), [SUN], 512)[0][0, -60 * TEXELS :].mean()
-    assert abs(rarely - 0.0487) < 0.0025
+
+
+def test_roulette_keeps_the_mean(fur: Scene) -> None:
+    """Paths of white fibres with a throughput of 0.2 go on as often as 0.4, by `SURVIVAL`, and weigh as much the more."""
+    tracer, count = Tracer.of(fur, 1), 20_000
+    strands = Hair.of(tracer, white(fur))
+    rng = np.random.default_rng(0)
+    triangle = rng.integers(strands.first, len(fur.triangles), count).astype(np.int32)
+    place, towards = tracer.corners[triangle].mean(1), tracer.normals[triangle]
+    there = strands.seen(triangle, place, towards, np.full((3, count), 0.2, np.float32), np.arange(count, dtype=np.int32))
+    origins, directions, throughput, owner = there.go_on(rng)
+    assert len(origins) == len(directions) == len(owner) == throughput.shape[1]
+    # Binomial: 0.87 % of the sum.
+    assert throughput[0].sum() == pytest.approx(0.2 * count, rel=4 * 0.0087)
+    assert len(owner) == pytest.approx(0.4 * count, rel=4 * 0.0087)
 
 
 def test_the_plan_names_strands_and_off_makes_them_diffuse(fur: Scene, cornell: Scene) -> None:
