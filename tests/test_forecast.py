@@ -257,9 +257,13 @@ def test_what_dominates_is_said_with_what_would_shorten_it() -> None:
     assert part.then == pytest.approx(part.seconds / 2)
     assert found.parts == tuple(sorted(found.parts, key=lambda part: -part.seconds))
     lines = str(found).splitlines()
-    assert [line.split("  ")[0] for line in lines[1:-2]] == [*(stage.name for stage in found.stages), "total"]
-    assert lines[-1].startswith(f"of {found.seconds:.3g} s, ")
-    assert found.parts[0].setting in lines[-1]
+    told = [line.split("  ")[0] for line in lines[1:]]
+    assert told[: told.index("total") + 1] == [*(stage.name for stage in found.stages), "total"]
+    dominant = lines[told.index("total") + 3]  # below that of memory
+    assert dominant.startswith(f"of {found.seconds:.3g} s, ")
+    assert found.parts[0].setting in dominant
+    called = [effect.name for effect in found.effects.effects if effect.called]
+    assert [line.split(":")[0] for line in lines[told.index("total") + 4 :]] == [f"effect {name}" for name in called]
     assert 0.01 < found.peak_gib < 64
     assert found.spent > 0
 

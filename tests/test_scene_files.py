@@ -5,6 +5,7 @@ import io
 import json
 import re
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -704,3 +705,36 @@ def test_textures_with_coordinates_of_their_own_count_by_their_mean(tmp_path: Pa
     assert scene.materials[0].emission.texture is not None
     assert scene.uv is not None
     np.testing.assert_allclose(scene.uv[0], [0.25, 0.5])
+
+
+def milky(**extensions: dict) -> Writer:
+    """A tetrahedron of a material with extensions, closed."""
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])[[[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]]
+    writer = Writer()
+    found = {f"KHR_materials_{name}": value for name, value in extensions.items()}
+    writer.json["materials"] = [{"name": "milk", "extensions": found}]
+    writer.json["extensionsUsed"] = list(found)
+    writer.node(mesh=writer.mesh(normals=False, positions=corners.reshape(-1, 3), material=0))
+    return writer
+
+
+def test_volumes_that_scatter_are_media(tmp_path: Path) -> None:
+    """Extinction is -log(colour) / distance; the albedo sends back the colour of multiple scattering."""
+    volume = {"thicknessFactor": 1, "attenuationDistance": 0.02, "attenuationColor": [0.5, 0.25, 0.1]}
+    scatter = {"multiscatterColor": [0.9, 0.6, 0.2], "scatterAnisotropy": 0.4}
+    through = {"transmission": {"transmissionFactor": 1}}
+    whole = milky(volume=volume, volume_scatter=scatter, ior={"ior": 1.3}, **through)
+    scene = load_scene(whole.glb(tmp_path / "milk.glb"))
+    medium = scene.materials[0].subsurface
+    assert medium is not None
+    np.testing.assert_allclose(medium.mean_free_path, -0.02 / np.log([0.5, 0.25, 0.1]))
+    assert (medium.anisotropy, medium.index) == (0.4, 1.3)
+    np.testing.assert_allclose(replace(medium, index=1.0).thick_albedo, [0.9, 0.6, 0.2], atol=1e-9)
+    assert scene.materials[0].gloss is None
+    assert scene.notes == ("12 missing shading normals made from the faces",)
+    for left_out in ("volume", "volume_scatter", "transmission"):
+        parts = {"volume": volume, "volume_scatter": scatter, **through}
+        del parts[left_out]
+        opaque = load_scene(milky(**parts).glb(tmp_path / f"{left_out}.glb"))
+        assert opaque.materials[0].subsurface is None
+        assert any("no KHR_materials_volume_scatter" in note for note in opaque.notes) is (left_out == "volume_scatter")

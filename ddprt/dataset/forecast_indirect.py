@@ -2,7 +2,8 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from ddprt.lights import Lighting
 from ddprt.transport.direct import Texels
 from ddprt.transport.glossiness import valid_integrator
 from ddprt.transport.sources import Sent
+from ddprt.transport.translucency import filled
 
 _BLOCK = 16  # rows of an EXR that are compressed together
 _FEW, _LOOKED_AT = 8, 2  # rays and lightings that tell what maps look like
@@ -24,6 +26,7 @@ _SEEN = 1 << 16  # texels that get these rays
 SCRATCHED = 1 << 25  # bytes of maps in the making that tell how long the disk takes
 _REFERENCE = 512  # paths of the reference where nothing else is asked for
 _SHADED = 4, 16  # lightings whose difference tells what a further one costs the paths
+_WALKED, _STEPS = 256, 64  # texels of bodies, and walks of each, that tell what walks take
 _NAMES = {"train": "training", "test": "held-out"}
 
 
@@ -77,6 +80,8 @@ def _by_operator(job: Sampled, split: str, indices: list[int], seen: list[int], 
     halves, count, wide = 1 + test, len(indices), min(len(indices), WIDE)
     begun, before = time.perf_counter(), job.tracer.rays
     operator = Operator.of(job.tracer, job.atlas, config.sender_resolution)
+    if any(filled(job.scene)):
+        operator = replace(operator, inside=import_module("ddprt.transport.subsurface").Inside.of(operator, job.scene))
     covered = job.atlas.slot >= 0
     making = time.perf_counter() - begun
 
@@ -109,6 +114,10 @@ def _by_operator(job: Sampled, split: str, indices: list[int], seen: list[int], 
         half, _, _, fewer, *_ = costs(wide // 2)
         bouncing = on_a_line((wide // 2, half), (wide, bouncing), count)
         gathering = on_a_line((wide // 2, fewer.seconds), (wide, gathering), count)
+    walking = 0.0
+    if operator.inside:
+        walking, more = _walking(job, operator.inside, bounced.arrived, test, count / wide)
+        rays += more
     again = 0.0
     if test:
         again, more = direct_again(job, seen, count, operator.averaged)
@@ -126,7 +135,27 @@ def _by_operator(job: Sampled, split: str, indices: list[int], seen: list[int], 
     light = bounced.radiosity.reshape(operator.senders.count, -1, 3)[:, few].reshape(operator.senders.count, -1)
     sent = Sent(operator, bounced, {"seed": seed, "stream": f"{split} 0", "near": near})
     look = _Look(operator, np.ascontiguousarray(light), noise, choice.footprints.pooled if choice.footprints else None, sent)
-    return making + averaging + halves * bouncing + choosing + again + gathering + writing, int(rays), look
+    return making + averaging + halves * bouncing + choosing + again + walking + gathering + writing, int(rays), look
+
+
+def _walking(job: Sampled, inside: Any, arrived: np.ndarray, test: bool, larger: float) -> tuple[float, float]:
+    """Seconds and rays of walks through bodies: by a few from some texels; `larger`: all lightings over those at hand."""
+    config, halves, address = job.config.transport, 1 + test, {"seed": job.config.seed, "stream": "walking"}
+    begun, before = time.perf_counter(), job.tracer.rays
+    walks = config.test_samples if test else config.samples
+    if walks == "auto":
+        walks = halves * inside.choose(arrived, config.target_noise * halves**0.5, **address)[0]
+    choosing, some = time.perf_counter() - begun, inside.texels[:: max(1, len(inside.texels) // _WALKED)]
+    found = []
+    for light in (arrived[:, :3], arrived):
+        start, traced = time.perf_counter(), job.tracer.rays
+        for _ in inside.leave(np.ascontiguousarray(light), _STEPS, texels=some, **address):
+            pass
+        found.append((time.perf_counter() - start, job.tracer.rays - traced))
+    (one, _), (all_of_them, each) = found
+    share = walks * len(inside.texels) / (_STEPS * max(len(some), 1))
+    products = max(0.0, all_of_them - one) * larger * len(inside.texels) / max(len(some), 1)
+    return choosing + one * share + products, job.tracer.rays - before + each * share
 
 
 def _fewer_rays(job: Sampled, split: str, seconds: float, power: float, samples: float) -> Part:

@@ -36,6 +36,7 @@ from ddprt.transport.embree import Tracer
 from ddprt.transport.glossiness import scattering
 from ddprt.transport.measure import measure
 from ddprt.transport.openness import build_open_atlas
+from ddprt.transport.translucency import filled, refuse_filled
 
 DEPTH = 0.75  # of the distance between samples: what they mistake for a constant shrinks to 1.8 %
 _NAMED = 8  # doubtful lightings, or altered files, that a message spells out
@@ -179,6 +180,8 @@ class _Bake:
             lightings = [lighting for _, lighting in entries]
         effects = plan(self.scene, lightings, bounces=self.config.transport.bounces, probes=self.config.probes.asked)
         description = self._description(entries, effects, drawn, samples)
+        if description["transport"]["integrator"] != "operator" or effects.called("emission"):
+            refuse_filled(self.scene, "transport.integrator" if not effects.called("emission") else "emission")
         if description["transport"]["integrator"] != "operator":  # which tells what it left out, if anything
             for effect in (effect for effect in effects.effects if effect.bound is None and not effect.forced):
                 self.progress.warn(f"{effect.name}: {effect.why}")
@@ -216,6 +219,7 @@ class _Bake:
             "ddprt": __version__,
             **{key: value for key, value in baked_settings(self.config, self.scene).items() if value != []},
             "quantity": "irradiance",
+            **({"exitant": exitant} if (exitant := self._exitant()) else {}),
             "unit": "W/m2",
             "points": self._points(samples),
             "plan": [asdict(effect) for effect in effects.effects],
@@ -223,6 +227,10 @@ class _Bake:
             "lightings": _records(entries),
             **({"skies": skies} if (skies := pictures([lighting for _, lighting in entries])) else {}),
         }
+
+    def _exitant(self) -> list[str]:
+        """Materials whose texels hold what leaves them, W/m² before albedo, instead of the irradiance."""
+        return [entry.name for entry, inside in zip(self.scene.materials, filled(self.scene), strict=True) if inside]
 
     def _points(self, samples: Samples) -> dict[str, Any]:
         return {"count": self.config.points.count, "digest": samples.digest}

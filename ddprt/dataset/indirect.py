@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from typing import Any
 
@@ -27,9 +27,13 @@ from ddprt.transport.embree import Tracer
 from ddprt.transport.footprint import Footprints
 from ddprt.transport.glossiness import glossy
 from ddprt.transport.sources import Sent, Shown
+from ddprt.transport.translucency import filled
 
 _SHARE, _LARGE = 64, 1 << 26  # of maps in the making that is tried out; bytes below which they take no time that matters
 _REFERENCE_SAMPLES = 512  # paths of the reference where nothing else is asked for
+
+Leaving = tuple[Int[np.ndarray, " inside"], Float32[np.ndarray, "lightings inside 3"]]
+"""Texels of bodies that light passes, and what leaves them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,9 +63,9 @@ class IndirectBake:
     def run(self, split: str, indices: list[int]) -> None:
         """Bakes lightings that share their gather rays: "train" (with validation), or "test"."""
         sent: Callable[[int], Sent] = partial(self._sent, split, indices)
-        if self._probes:
-            sent = cache(sent)  # of maps and probes
-        self._maps(split, indices, sent)
+        if self._probes or self._passing:
+            sent = cache(sent)  # of maps, bodies and probes
+        self._maps(split, indices, sent, self._leaving(split, indices, sent))
         if self._probes:
             dark = self.config.transport.bounces == 0 or not scatters(self.scene)
             source = partial(self._seen, split, indices) if any(glossy(self.scene)) else sent
@@ -79,7 +83,32 @@ class IndirectBake:
         scene = self.scene, self.tracer, self.atlas
         return GlossBake.all(self.config, *scene, self.dataset, self.manifest, bounces=self.effects.bounces)
 
-    def _maps(self, split: str, indices: list[int], sent: Callable[[int], Sent]) -> None:
+    @cached_property
+    def _passing(self) -> Any:
+        """The `ddprt.transport.subsurface.Inside` of bodies that light passes; None where there are none."""
+        module = self.effects.module("subsurface")
+        return module.Inside.of(self._solid, self.scene) if module and any(filled(self.scene)) else None
+
+    def _leaving(self, split: str, indices: list[int], sent: Callable[[int], Sent]) -> list[Leaving]:
+        """What leaves texels of bodies, for each half; nothing where there are none, or where it is baked."""
+        kinds = ["indirect", "noise"] if split == "test" else ["indirect"]
+        if self._passing is None or not self.manifest.lacks(kinds, indices):
+            return []
+        config, texels, found = self.config.transport, self._passing.texels, list[Leaving]()
+        given = config.test_samples if split == "test" else config.samples
+        with self.progress.stage(f"subsurface {split}", len(kinds) * len(texels)) as stage:
+            before = self.tracer.rays
+            for half in range(len(kinds)):
+                light, address = sent(half).bounced.arrived, {"seed": self.config.seed, "stream": f"{split} {half}"}
+                if given == "auto":
+                    each, noise = self._passing.choose(light, config.target_noise * len(kinds) ** 0.5, **address)
+                    given = each * len(kinds)
+                    stage.facts["noise_expected"] = float(f"{noise / len(kinds) ** 0.5:.3g}")
+                found.append((texels, self._passing.whole(light, max(1, given // len(kinds)), stage.advance, **address)))
+            stage.facts |= {"walks": given, "rays": self.tracer.rays - before}
+        return found
+
+    def _maps(self, split: str, indices: list[int], sent: Callable[[int], Sent], leaving: list[Leaving]) -> None:
         kinds = ["indirect", "noise"] if split == "test" else ["indirect"]
         todo = self.manifest.lacks(kinds, indices)
         if not todo:
@@ -88,14 +117,14 @@ class IndirectBake:
             before = self.tracer.rays
             stage.facts["integrator"] = self.dataset.description["transport"]["integrator"]
             if self.effects.bounces == 0:
-                dark = np.zeros((self.atlas.count, 3), np.float32)
-                self._write(todo, lambda index: [dark] * len(kinds), kinds)
+                dark = np.zeros((len(indices), self.atlas.count, 3), np.float32)
+                self._finish([dark] * len(kinds), indices, todo, kinds, lambda light: light, leaving)
             elif self.dataset.description["transport"]["integrator"] == "reference":
                 self._by_reference(split, todo, kinds, stage)
             elif self.dataset.description["transport"]["integrator"] == "paths":
                 self._by_paths(split, indices, todo, kinds, stage)
             else:
-                self._by_operator(split, indices, todo, kinds, stage, sent)
+                self._by_operator(split, indices, todo, kinds, stage, sent, leaving)
             stage.facts["rays"] = self.tracer.rays - before
 
     def constant(self) -> None:
@@ -123,6 +152,11 @@ class IndirectBake:
 
     @cached_property
     def _operator(self) -> Any:
+        return replace(self._solid, inside=self._passing) if self._passing else self._solid
+
+    @cached_property
+    def _solid(self) -> Any:
+        """As if no light passed anything."""
         from ddprt.transport.operator import Operator
 
         return Operator.of(self.tracer, self.atlas, self.config.transport.sender_resolution)
@@ -150,6 +184,7 @@ class IndirectBake:
         kinds: list[str],
         stage: Stage,
         sent: Callable[[int], Sent],
+        leaving: list[Leaving],
     ) -> None:
         from ddprt.transport.effort import choose_rays
 
@@ -162,7 +197,9 @@ class IndirectBake:
             if rays is None:
                 bouncing = time.perf_counter() - begun
                 chosen = choose_rays(operator, bounced.radiosity, config, held_out=test, **address)
-                rays, footprints = chosen.rays, chosen.footprints
+                rays, footprints = chosen.rays.copy(), chosen.footprints
+                for texels, _ in leaving:
+                    rays[texels] = 0
                 stage.facts |= chosen.facts | self._facts(bounced, operator)
                 storing = self._storing(indices, todo, kinds, chosen.facts["noise_expected"], footprints)
                 spent = storing + time.perf_counter() - begun + (len(kinds) - 1) * bouncing  # each half bounces its own light
@@ -179,7 +216,10 @@ class IndirectBake:
                 scratch, operator.gather(bounced.radiosity, scratch.maps, rays, skip=scratch.done, **address), stage, rays
             )
             parts.append(scratch)
-        self._finish(parts, indices, todo, kinds, footprints.pooled if footprints else lambda light: light)
+        pooled = footprints.pooled if footprints else lambda light: light
+        self._finish([part.maps for part in parts], indices, todo, kinds, pooled, leaving)
+        for part in parts:
+            part.remove()
 
     def _storing(
         self, indices: list[int], todo: list[int], kinds: list[str], noise: float, footprints: Footprints | None
@@ -216,23 +256,35 @@ class IndirectBake:
         return Scratch(self.dataset.folder / f"{split}-{half}.part", (len(indices), self.atlas.count, 3), key)
 
     def _finish(
-        self, parts: list[Scratch], indices: list[int], todo: list[int], kinds: list[str], last: Callable[[Any], Any]
+        self,
+        parts: Sequence[np.ndarray],
+        indices: list[int],
+        todo: list[int],
+        kinds: list[str],
+        last: Callable[[Any], Any],
+        leaving: Sequence[Leaving] = (),
     ) -> None:
         """Writes the maps: the mean of two halves and half their difference, or what `last` makes of the only part.
+
+        What leaves bodies takes its place in them.
 
         Where few rays meet something near, noise may reach below zero (transport/near.py). It ends here, which changes the
         Cornell box's energy by 1.5e-5 at 8 rays per texel, by 8e-7 at 32 and not at all at the default noise.
         """
 
         def finished(index: int) -> list[np.ndarray]:
-            halves = [part.maps[indices.index(index)] for part in parts]
+            row = indices.index(index)
+            halves = [part[row] for part in parts]
             if len(halves) == 1:
-                return [np.maximum(last(halves[0]), 0)]
+                halves = [last(halves[0])]
+            for half, (texels, values) in enumerate(leaving):
+                halves[half] = halves[half].copy()
+                halves[half][texels] = values[row]
+            if len(halves) == 1:
+                return [np.maximum(halves[0], 0)]
             return [np.maximum((halves[0] + halves[1]) / 2, 0), (halves[0] - halves[1]) / 2]
 
         self._write(todo, finished, kinds)
-        for part in parts:
-            part.remove()
 
     def _facts(self, bounced: Any, operator: Any) -> dict[str, Any]:
         """What the series left out; said aloud where that matters."""
@@ -247,7 +299,15 @@ class IndirectBake:
     def _averaged(self, operator: Any, indices: Sequence[int], half: int) -> Float32[np.ndarray, "senders columns"]:
         """Direct light of all lightings on the senders."""
         direct = self._direct(half)
-        return np.concatenate(list(self.tracer.map(lambda index: operator.averaged(direct(index)), indices)), 1)
+
+        def work(index: int) -> Float32[np.ndarray, "senders 3"]:
+            light = direct(index)
+            if operator.inside:
+                rng = seeds.stream(self.config.seed, "entering", index, half)
+                light = operator.inside.entering(light, self.dataset.lightings[index], rng)
+            return operator.averaged(light)
+
+        return np.concatenate(list(self.tracer.map(work, indices)), 1)
 
     def _direct(self, half: int) -> Callable[[int], Float32[np.ndarray, "texels 3"]]:
         """Direct light of a lighting on the texels: as it was baked, or a second time for an independent half."""
@@ -297,7 +357,9 @@ class IndirectBake:
             address: dict[str, Any] = {"samples": samples, "stream": f"{stream} {half}", **shared}
             self._follow(scratch, trace_paths(*scene, scratch.maps, skip=scratch.done, **address), stage, paths)
             parts.append(scratch)
-        self._finish(parts, indices, todo, kinds, lambda light: light)
+        self._finish([part.maps for part in parts], indices, todo, kinds, lambda light: light)
+        for part in parts:
+            part.remove()
 
     def _by_reference(self, split: str, todo: list[int], kinds: list[str], stage: Stage) -> None:
         from ddprt.transport.reference import on_texels, trace_reference

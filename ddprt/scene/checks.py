@@ -10,7 +10,7 @@ from ddprt.axes import Float, Int
 from ddprt.errors import UserError
 from ddprt.scene.material import Material
 from ddprt.scene.mesh import Scene
-from ddprt.scene.winding import repeats, surfaces, welded, winding
+from ddprt.scene.winding import repeats, rims, surfaces, welded, winding
 
 UNSAID = 0.8
 """Albedo where a file names none: that of a matt white wall."""
@@ -23,6 +23,9 @@ FARTHEST = 1e15
 
 BRIGHTEST = 1e30
 """W/(m² sr); beyond it sums leave float32."""
+
+DENSEST = 4.0
+"""Largest relative index of refraction: that of germanium."""
 
 
 def checked(
@@ -95,6 +98,7 @@ def checked(
     if twisted:
         found.append(f"{twisted} surfaces have one side only (like a Moebius strip): winding left as it was")
 
+    _holds_media(name, weld[triangles], positions[triangles], material, materials)
     used, triangles = np.unique(triangles, return_inverse=True)
     triangles = triangles.reshape(-1, 3)
     if dropped := len(positions) - len(used):
@@ -208,8 +212,57 @@ def _reflects(name: str, material: Material, uv: np.ndarray | None) -> None:
     gloss = material.gloss
     if gloss and not all(0 <= value <= 1 for value in (gloss.roughness, gloss.metallic, gloss.dielectric)):
         raise UserError(f"{name}: got {gloss} {of}, expected roughness, metallic and dielectric from 0 to 1; correct it")
+    if (medium := material.subsurface) is not None:
+        shares, lengths = medium.albedo, medium.mean_free_path
+        sound = len(shares) == len(lengths) == 3 and all(0 <= share <= 1 for share in shares)
+        sound = sound and all(0 < length < FARTHEST for length in lengths) and -1 < medium.anisotropy < 1
+        if not (sound and 1 <= medium.index <= DENSEST):
+            raise UserError(
+                f"{name}: got {medium} {of}, expected three albedos from 0 to 1, three mean free paths above 0 m, an "
+                f"anisotropy between -1 and 1 and an index from 1 to {DENSEST:g}; correct it"
+            )
     if material.cutout and not 0 <= material.cutout.cutoff <= 1:
         raise UserError(f"{name}: got cutoff {material.cutout.cutoff:g} {of}, expected 0 to 1; correct it")
+
+
+def _holds_media(
+    name: str, places: np.ndarray, corners: np.ndarray, material: np.ndarray, materials: tuple[Material, ...]
+) -> None:
+    """Makes sure that a medium is shut in: by closed surfaces of one material each, seen from outside.
+
+    Args:
+      name: for messages.
+      places, corners: of the triangles, by number (see `welded`) and in metres.
+      material, materials: of each triangle, and all.
+    Raises:
+      UserError: edges without a triangle on each side, which light would leak through; other materials on the same surface; or
+        fronts that face inwards.
+    """
+    filled = np.array([entry.subsurface is not None for entry in materials])[material]
+    if not filled.any():
+        return
+    surface, is_closed = surfaces(places)
+    for number in np.unique(surface[filled]):
+        own = np.flatnonzero(surface == number)
+        entry = materials[material[own[filled[own]][0]]]
+        of = f'"{entry.name}", which is filled with a medium,'
+        if not is_closed[number]:
+            edges, first = rims(places[own])
+            x, y, z = corners[own[first // 3], first % 3].round(4).tolist()
+            raise UserError(
+                f"{name}: got {edges} open edges on a surface of material {of} the first at ({x:g}, {y:g}, {z:g}) m, expected "
+                "a closed one, which light does not leak from; close or weld the mesh, or take the medium out of the material"
+            )
+        if len(others := np.unique(material[own])) > 1:
+            found = ", ".join(f'"{materials[index].name}"' for index in others)
+            raise UserError(
+                f"{name}: got a surface of materials {found} that hangs together, expected {of} to have it alone; part the mesh"
+            )
+        a, b, c = np.moveaxis(corners[own] - corners[own].mean((0, 1)), 1, 0)
+        if np.einsum("td,td->", a, np.cross(b, c)) <= 0:
+            raise UserError(
+                f"{name}: got a surface of material {of} whose fronts face inwards, expected them to face outwards; flip it"
+            )
 
 
 def _sheets(corners: np.ndarray, turned: np.ndarray) -> str:

@@ -1,9 +1,11 @@
 """glTF 2.0 in (.glb, .gltf): triangles and materials; what is not read is named once and ignored.
 
 Base colour factors are linear and base textures sRGB, as the standard says, and their product is the albedo. Emission counts
-as W/(m² sr). Blended surfaces are taken as cut out where their opacity is below a half. All textures of a material are looked
-up at one place, the first one's: of another that has texture coordinates of its own the mean is taken, and said so. A
-primitive without normals is flat.
+as W/(m² sr). Blended surfaces are taken as cut out where their opacity is below a half. A volume that light gets into and that
+scatters is a medium: its extinction is the volume's attenuation, its albedo what sends back the colour of multiple scattering
+where it is thick; its surface is smooth, whatever the roughness. All textures of a material are looked up at one place, the
+first one's: of another that has texture coordinates of its own the mean is taken, and said so. A primitive without normals is
+flat.
 """
 
 import warnings
@@ -19,7 +21,7 @@ from ddprt.axes import Float, Float64, Int
 from ddprt.scene.accessors import Container, open_gltf
 from ddprt.scene.checks import UNSAID, checked
 from ddprt.scene.images import linear_image, plain_image
-from ddprt.scene.material import Cutout, Emission, Gloss, Material
+from ddprt.scene.material import Cutout, Emission, Gloss, Material, Subsurface
 from ddprt.scene.mesh import Scene
 
 REFUSED = {
@@ -31,8 +33,16 @@ REFUSED = {
 }
 """Extensions whose absence would lose geometry or textures, and the way out."""
 
+_INDEX, _VOLUME, _SCATTER = "KHR_materials_ior", "KHR_materials_volume", "KHR_materials_volume_scatter"
+_PASSING = {
+    "KHR_materials_transmission": "transmissionFactor",
+    "KHR_materials_diffuse_transmission": "diffuseTransmissionFactor",
+}
 _STRENGTH = "KHR_materials_emissive_strength"
-UNDERSTOOD = ("KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp", _STRENGTH)
+UNDERSTOOD = (
+    *("KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp", _STRENGTH),
+    *(_INDEX, _VOLUME, _SCATTER, *_PASSING),
+)
 HARMLESS = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "KHR_animation", "KHR_node_visibility")
 """May be required by a file and are still only ignored."""
 
@@ -201,6 +211,7 @@ class _Reader:
         )
         red, green, blue, alpha = (float(value) for value in base.baseColorFactor or [1.0] * 4)
         texture = None if base.baseColorTexture is None else self._image(base.baseColorTexture.index, linear_image)
+        medium = self._subsurface(entry, name)
         return Material(
             name,
             (red, green, blue),
@@ -208,8 +219,26 @@ class _Reader:
             bool(entry.doubleSided),
             self._cutout(entry, name, alpha),
             self._emission(entry, name),
-            self._gloss(entry, name),
+            None if medium else self._gloss(entry, name),
+            medium,
         )
+
+    def _subsurface(self, entry: Any, name: str) -> Subsurface | None:
+        """The medium that fills it; None where light does not get in, or nothing inside scatters it."""
+        extensions = entry.extensions or {}
+        volume, passing = extensions.get(_VOLUME, {}), [extensions.get(key, {}).get(what, 0) for key, what in _PASSING.items()]
+        if not volume.get("thicknessFactor", 0) or not any(passing):
+            return None
+        scatter, distance = extensions.get(_SCATTER), volume.get("attenuationDistance", np.inf)
+        fading = -np.log(np.maximum(volume.get("attenuationColor", [1.0] * 3), 1e-6)) / distance
+        if scatter is None or not (fading > 0).all():
+            why = "no KHR_materials_volume_scatter" if scatter is None else "a channel that nothing dims"
+            self.notes.append(f'material "{name}": a volume with {why} is not simulated; taken as opaque')
+            return None
+        g = float(scatter.get("scatterAnisotropy", 0.0))
+        red, green, blue = (Subsurface.single_albedo(float(value), g) for value in scatter.get("multiscatterColor", [0.0] * 3))
+        x, y, z = (1 / fading).tolist()
+        return Subsurface((red, green, blue), (x, y, z), g, float(extensions.get(_INDEX, {}).get("ior", 1.5)))
 
     def _cutout(self, entry: Any, name: str, alpha: float) -> Cutout | None:
         """Its holes; None where it has none."""

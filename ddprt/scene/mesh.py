@@ -89,7 +89,7 @@ class Scene:
                 state.update(str(array.shape).encode() + np.ascontiguousarray(array).tobytes())
         state.update(repr([material.albedo for material in self.materials]).encode())
         for index, material in enumerate(self.materials):
-            for part in (material.cutout, material.emission, material.gloss):
+            for part in (material.cutout, material.emission, material.gloss, material.subsurface):
                 if part is not None:
                     state.update(f"{index} {part}".encode())
             for name, image in material.textures.items():

@@ -93,3 +93,16 @@ def surfaces(corners: Int[np.ndarray, "triangles 3"]) -> tuple[Int[np.ndarray, "
     is_closed[surface[count:][balance != 0]] = False
     _, own = np.unique(surface[:count], return_inverse=True)
     return own, is_closed[np.unique(surface[:count])]
+
+
+def rims(corners: Int[np.ndarray, "triangles 3"]) -> tuple[int, int]:
+    """How many edges lack a triangle on one side, and where the first of them starts: 3 * triangle + corner.
+
+    Args:
+      corners: place of each corner, wound alike.
+    """
+    start, end = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
+    edges, number = np.unique(np.sort(np.stack([start, end], 1), axis=1), axis=0, return_inverse=True)
+    is_open = np.bincount(number.ravel(), np.where(start < end, 1, -1), len(edges)) != 0
+    found = np.flatnonzero(is_open[number.ravel()])
+    return int(is_open.sum()), int(found[0]) if len(found) else -1

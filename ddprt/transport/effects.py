@@ -24,6 +24,7 @@ from ddprt.scene.mesh import Scene
 from ddprt.scene.sheets import backs, without_backs
 from ddprt.sections import TransportConfig
 from ddprt.transport.glossiness import glossy, lobe_left, worth_gloss
+from ddprt.transport.translucency import filled, opaque
 
 _FLAT = 1e-6  # of the radius: how far a corner may stand before a triangle's plane and still be in it
 _CHUNK = 1 << 22
@@ -222,15 +223,15 @@ def _decided(name: str, entry: Entry, question: Question) -> Effect:
 
 def _diffuse_bounces(name: str, question: Question) -> Effect:
     bounces = question.bounces
-    brightest = max(question.scene.used_materials, key=lambda material: material.brightest)
-    albedo = brightest.brightest
+    brightest = max(map(opaque, question.scene.used_materials), key=lambda material: material.brightest)
+    albedo, inside = brightest.brightest, any(filled(question.scene))
     if albedo == 0 and not any(glossy(question.scene)):
         return Effect(name, False, "every material is black")
     if sees_nothing(question.scene):
         return Effect(name, False, "no surface faces another: the scene is convex seen from outside")
     if bounces >= 0:
         glows = any(_brightest(material) for material in question.scene.used_materials)  # with lamps however dim
-        left = albedo ** (bounces + 1) / (1 - albedo) if albedo < 1 and not glows else None
+        left = albedo ** (bounces + 1) / (1 - albedo) if albedo < 1 and not (glows or inside) else None
         return Effect(name, bounces > 0, f"forced to {bounces} (largest albedo {albedo:.3g})", left, True)
     why = f'largest albedo {albedo:.3g} ("{brightest.name}"), and surfaces face each other'
     if albedo >= 1:
@@ -323,6 +324,16 @@ def _without_emission(scene: Scene) -> Scene:
     return scene.made_of(lambda material: replace(material, emission=None))
 
 
+def _subsurface(name: str, question: Question) -> Effect:
+    users = question.users(lambda material: material.subsurface)
+    return Effect(name, bool(users), users or "no material is filled with a medium")
+
+
+def _subsurface_left(question: Question) -> float | None:
+    """A body alone sends out at most what falls on it, and no less than nothing; among others light may go round."""
+    return 1.0 if sees_nothing(question.scene) else None
+
+
 def _probes(name: str, question: Question) -> Effect:
     asked = question.probes
     return Effect(name, bool(asked), f"the configuration asks for {asked}" if asked else "the configuration asks for none")
@@ -342,6 +353,15 @@ EFFECTS: Catalogue[Entry] = Catalogue(
         "cut-outs": Entry(_material(pierced, "no material has holes"), "cutouts", _without_cutouts),
         "two-sided sheets": Entry(_two_sided, without=without_backs),
         "emission": Entry(_emission, "emission", _without_emission),
+        "subsurface": Entry(
+            _subsurface,
+            "subsurface",
+            lambda scene: scene.made_of(opaque),
+            _subsurface_left,
+            lambda question: (
+                "as many walks as the noise that is asked for takes, each of many short rays, once for all lightings"
+            ),
+        ),
         "probes": Entry(_probes, "probes", lambda scene: scene, lambda question: 0.0),  # no lightmap has light from them
     },
 )

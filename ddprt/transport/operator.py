@@ -27,6 +27,7 @@ from ddprt.transport.direct import centred
 from ddprt.transport.embree import Tracer
 from ddprt.transport.gather import Landing, Receivers, seen_from
 from ddprt.transport.near import WIDTHS, NearField
+from ddprt.transport.reflection import Reflection
 
 _SENDER_RESOLUTION = 128  # senders along a side where nothing else is asked for
 _COARSE = 3000  # most blocks that bounces are solved on
@@ -44,11 +45,13 @@ class Bounced:
       radiosity: W/m².
       bounces: bounces that will have been counted once it is gathered.
       remainder: bound on the light of all further bounces, as a share of the lighting's largest indirect value.
+      arrived: on senders of bodies that light passes, direct light and all bounces, W/m²; None where there are none.
     """
 
     radiosity: Float32[np.ndarray, "senders columns"]
     bounces: int
     remainder: float
+    arrived: Float32[np.ndarray, "inside columns"] | None = None
 
     @property
     def converged(self) -> bool:
@@ -77,12 +80,14 @@ class Operator:
       tracer, atlas: the scene.
       senders: what light leaves from.
       coarse: larger blocks of senders, which further bounces are solved on.
+      inside: the `ddprt.transport.subsurface.Inside` of bodies that light passes; None where there are none.
     """
 
     tracer: Tracer
     atlas: Atlas
     senders: Senders
     coarse: Senders
+    inside: Any = None
 
     @classmethod
     def of(cls, tracer: Tracer, atlas: Atlas, sender_resolution: int = 0) -> "Operator":
@@ -109,6 +114,8 @@ class Operator:
         """Looks closer at what is within so many widths of a coarse block; arguments as for `bounce`."""
         area = np.zeros(self.senders.count)
         area[self.senders.of_texel] = self.coarse.area[self.coarse.of_texel]
+        if self.inside:
+            area[self.inside.senders] = 0  # light comes out of a body smoothly, and not where it fell on it
         lights = [centred(self.tracer, lighting) for lighting in lightings]
         albedo, reach = self.senders.albedo.astype(np.float32), (widths**2 * area).astype(np.float32)
         return NearField(self.tracer, self.landing, lights, direct, albedo, reach, bounces < 0)
@@ -135,24 +142,25 @@ class Operator:
           seed, stream: address of the random numbers; another stream gives independent noise.
           bounces: -1 goes on until what is left is negligible; otherwise exactly this many, at least 1.
         """
-        albedo = self.senders.albedo.astype(np.float32)
-        largest = float(albedo.max())
-        repeats = direct.shape[1] // 3
-        radiosity = direct * np.tile(albedo, repeats)
+        reflection = Reflection.of(
+            self.senders, self.coarse, direct.shape[1] // 3, self.inside and self.inside.matrix(seed=seed, stream=stream)
+        )
+        largest, radiosity = reflection.largest, reflection.radiosity(direct)
         if bounces == 1 or largest == 0:
             peak = direct.max(0, initial=0)
-            return Bounced(radiosity, 1, _remainder(largest, peak, peak))
+            return Bounced(radiosity, 1, _remainder(largest, peak, peak), reflection.arrived(direct))
         gather, term = self._between_senders(radiosity, seed, stream)
-        reflected = np.tile(self.coarse.albedo.astype(np.float32), repeats)
+        finer = _between(self.senders, self.coarse)
         total = term.copy()
         summed, left = 2, _remainder(largest, term.max(0), total.max(0))
         while (left > _TOLERANCE if bounces < 0 else summed < bounces) and summed < _MAX_BOUNCES:
-            term = gather @ (reflected * term)
+            term = gather @ reflection.coarsely(term, finer)
             total += term
             summed += 1
             left = _remainder(largest, term.max(0), total.max(0))
-        radiosity += np.tile(albedo, repeats) * (_between(self.senders, self.coarse) @ total)
-        return Bounced(radiosity, summed, left)
+        further = finer @ total
+        radiosity += reflection.radiosity(further)
+        return Bounced(radiosity, summed, left, reflection.arrived(direct, further))
 
     def _between_senders(
         self, radiosity: Float32[np.ndarray, "senders columns"], seed: int, stream: str

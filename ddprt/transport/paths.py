@@ -27,6 +27,7 @@ from ddprt.transport.embree import Tracer
 from ddprt.transport.gather import Receivers
 from ddprt.transport.glossiness import glossy_surfaces
 from ddprt.transport.shading import shade, shift
+from ddprt.transport.translucency import refuse_filled
 from ddprt.transport.walk import Meetings, albedo_of, starts, walked
 
 _PROBED, _PILOT = 512, 32  # texels, and paths of each in two independent runs, that predict how many are needed
@@ -86,6 +87,7 @@ def follow(
     texels: Int[np.ndarray, " chosen"] | None = None,
 ) -> Iterator[int]:
     """The same with light of any kind: `shading` tells what vertices are worth."""
+    refuse_filled(scene, "unbiased paths")
     receivers = Receivers.texels(atlas, samples, seed, f"{stream} paths", texels)
     albedo, gloss = albedo_of(scene), glossy_surfaces(tracer, scene)
 

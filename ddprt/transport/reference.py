@@ -19,6 +19,7 @@ from ddprt.scene.mesh import Scene
 from ddprt.transport.direct import centred, direct_irradiance
 from ddprt.transport.embree import Tracer, lifted
 from ddprt.transport.glossiness import glossy_surfaces
+from ddprt.transport.translucency import refuse_filled
 
 _BATCH = 1 << 15  # paths traced together
 _MAX_SURVIVAL = 0.999  # a white closed room would never let a path go; a lower cap has no finite variance above its root
@@ -59,6 +60,7 @@ def trace_reference(
       seed: of the paths; equal seeds give equal bits whatever the number of threads.
       bounces: -1 follows every path to its end by roulette; otherwise at most this many.
     """
+    refuse_filled(scene, "unbiased paths")
     lights, gloss = centred(tracer, lighting), glossy_surfaces(tracer, scene)
     block = max(1, _BATCH // samples)
     rounds = -(-samples // _BATCH)
