@@ -38,6 +38,7 @@ def trials_figure(trials: Mapping[str, Sequence[tuple[float, float]]], budget: f
                 axes.loglog(found[:, 0], 100 * found[:, 1], mark, color=colour, alpha=0.7, label=name, markeredgewidth=0)
         axes.axvline(budget, color=INK["muted"], linestyle="--", linewidth=0.8)
         axes.set(xlabel="training seconds, without compiling", ylabel="error on validation (%)")
+        _plain(axes.xaxis, axes.yaxis)
         _legend(axes)
 
     return _svg("trials", draw)
@@ -93,9 +94,20 @@ def lightings_figure(
             ]
             axes.plot(ends, ends, color=INK["muted"], linewidth=0.8)
         axes.set(xlabel="svd-ridge, error of the lighting (%)", ylabel=f"{name} (%)")
+        _plain(axes.xaxis, axes.yaxis)
         _legend(axes)
 
     return _svg(f"lightings-{name}", draw)
+
+
+def _plain(*along: Any) -> None:
+    """Ticks at 1, 2 and 5 of each power of ten, written out."""
+    from matplotlib.ticker import FuncFormatter, LogLocator
+
+    for axis in along:
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter("")
 
 
 def _legend(axes: Any) -> None:
