@@ -13,6 +13,7 @@ from ddprt.dataset.generate import bake
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.lights import parse_lighting
+from ddprt.report.evaluate import spot_check
 from ddprt.scene.atlas import build_atlas
 from ddprt.scene.checks import checked
 from ddprt.scene.library import build
@@ -153,7 +154,8 @@ def baked(scene: Scene, lights: list[Any], tmp_path: Any, **changes: Any) -> Dat
 
 def test_a_lonely_body_glows_from_behind_by_as_much_light_as_enters(tmp_path: Any) -> None:
     """White and index-matched, convex: all light that falls on it leaves, and none is gathered; also where no lamp shines."""
-    data = baked(ball(), [lamp(0, 3, 0)] * 3, tmp_path, transport__samples=64, transport__test_samples=64)
+    scene = ball()
+    data = baked(scene, [lamp(0, 3, 0)] * 3, tmp_path, transport__samples=64, transport__test_samples=64)
     direct, indirect = (data.maps(kind, [0])[0] for kind in ("direct", "indirect"))
     area = data.area
     # 64 walks from each of 300 texels: single walks differ by about 1, so 0.7 % of noise; four of these.
@@ -164,6 +166,7 @@ def test_a_lonely_body_glows_from_behind_by_as_much_light_as_enters(tmp_path: An
     assert data.description["exitant"] == ["milk"]
     noise = data.maps("noise", data.split("test"))
     assert noise.any()
+    assert spot_check(scene, data, base(report__spot_check_texels=8)) == {}  # by the reference, which cannot see it
 
 
 def test_equal_seeds_give_equal_bits_and_a_body_lights_the_ground(tmp_path: Any) -> None:
