@@ -23,7 +23,7 @@ def looks(names: Sequence[str]) -> dict[str, tuple[str, str]]:
     return own
 
 
-def trials_figure(trials: Mapping[str, Sequence[tuple[float, float]]], budget: float) -> str:
+def trials_figure(trials: Mapping[str, Sequence[tuple[float, float]]], budget: float | int) -> str:
     """Validation error of every trial against the seconds that its training took; the budget dashed.
 
     Args:

@@ -10,6 +10,8 @@ from ddprt.dataset.store import Dataset
 from ddprt.report.metrics import Tally, Truth
 from ddprt.runtime.model import Model
 
+_REDRAWN = 100  # times, where a deal was dealt before
+
 
 def deal(data: Dataset, seed: int, number: int, train: int = 0) -> Dataset:
     """A dataset whose training and validation lightings have changed places; the files are the same.
@@ -21,8 +23,15 @@ def deal(data: Dataset, seed: int, number: int, train: int = 0) -> Dataset:
       train: keep only so many training lightings; 0 keeps all.
     """
     pool, count = [*data.split("train"), *data.split("validation")], len(data.split("train"))
-    if number:
-        pool = [pool[place] for place in seeds.stream(seed, "deal", number).permutation(len(pool))]
+    seen = {frozenset(pool[count:])}
+    for each in range(1, number + 1):
+        rng, before = seeds.stream(seed, "deal", each), pool
+        for _ in range(_REDRAWN):
+            pool = [before[place] for place in rng.permutation(len(before))]
+            if frozenset(pool[count:]) not in seen:
+                break
+        seen.add(frozenset(pool[count:]))
+        pool = pool if each == number else before
     where = dict.fromkeys(pool[: train or count], "train") | dict.fromkeys(pool[train or count : count], "unused")
     where |= dict.fromkeys(pool[count:], "validation")
     entries = [

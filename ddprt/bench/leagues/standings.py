@@ -46,9 +46,9 @@ LEAGUES: Catalogue[League] = Catalogue(
 class Budgets:
     """What may be spent in each league."""
 
-    bytes: float
-    flops: float
-    seconds: float
+    bytes: float | int
+    flops: float | int
+    seconds: float | int
 
 
 def budgets_of(asked: LeaguesConfig, baseline: Sequence[Record]) -> Budgets:

@@ -11,7 +11,7 @@ _FORMS = {"bytes": words.size, "count": words.count, "seconds": words.seconds}
 HEADS = ("method", "error", "against svd-ridge", "verdict", "ships", "operations", "training", "frame", "settings by seed")
 
 
-def amount(key: str, value: float) -> str:
+def amount(key: str, value: float | int) -> str:
     """A number of a league with its unit."""
     return _FORMS[LEAGUES[key].form](value)
 
@@ -31,7 +31,7 @@ def against(found: Difference | None) -> str:
 
 def rows(places: Sequence[Place]) -> list[tuple[str, ...]]:
     """Cells of a league's table, under `HEADS`."""
-    told = []
+    told: list[tuple[str, ...]] = []
     for place in places:
         if not place.errors:
             told.append((place.method, "out", "–", place.why, "–", "–", "–", "–", ""))
