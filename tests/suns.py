@@ -21,6 +21,8 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "residual": {"steps": 300, "width": 32},
     "neural-lightmap": {"steps": 100, "width": 8},
     "sh-prt": {"order": 1, "space": "linear"},
+    "light-network": {"features": 16, "length": 1.0, "steps": 100, "space": "linear"},
+    "point-set": {"steps": 100, "width": 16},
 }
 
 

@@ -13,10 +13,12 @@ from ddprt.errors import UserError, nearest
 from ddprt.methods import packages
 from ddprt.methods.autoencoder import Autoencoder
 from ddprt.methods.floors import MeanLightmap, NearestLighting
+from ddprt.methods.light_network import LightNetworks
 from ddprt.methods.method import Method
 from ddprt.methods.mlp import Mlp
 from ddprt.methods.neural_lightmap import NeuralMap
 from ddprt.methods.nonnegative import Nonnegative
+from ddprt.methods.point_set import PointSet
 from ddprt.methods.residual import Residual
 from ddprt.methods.sh_prt import ShPrt
 from ddprt.methods.svd_ridge import SvdRidge
@@ -33,6 +35,8 @@ METHODS: Catalogue[type[Method]] = Catalogue(
         "nonnegative": Nonnegative,
         "neural-lightmap": NeuralMap,
         "sh-prt": ShPrt,
+        "light-network": LightNetworks,
+        "point-set": PointSet,
     },
 )
 packages.register(METHODS)

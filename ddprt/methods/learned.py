@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,13 @@ from ddprt.training.loop import Problem, Trained, train
 from ddprt.training.schedule import Schedule
 
 Layers = tuple[tuple[Float[Array, "_ _"], Float[Array, " _"]], ...]
+
+
+@runtime_checkable
+class TakesAnyPoints(Protocol):
+    """A Relighter that answers from some of the points it was trained with, in any order, by their positions and normals."""
+
+    any_points: ClassVar[bool]
 
 
 class Learned(Method):

@@ -17,6 +17,7 @@ from ddprt.dataset.store import average_into_points
 from ddprt.errors import UserError
 from ddprt.fitting.encoding import Encoding
 from ddprt.lights import Light, Lighting, parse_lighting
+from ddprt.methods.learned import TakesAnyPoints
 from ddprt.methods.method import AsksForLights, Frame, Relighter
 from ddprt.runtime.coefficients import Coefficients
 from ddprt.runtime.trust import Trust, Yardstick
@@ -70,6 +71,7 @@ class Model:
         values: Any,
         *,
         lightings: Any = None,
+        points: Any = None,
         clamp: bool | str = True,
         fade: bool = False,
         constant: bool = True,
@@ -79,6 +81,7 @@ class Model:
         Args:
           values: (points, 3) or (frames, points, 3) measured light in W/m², of `quantity`.
           lightings: what was measured: a lighting, or one for each frame. Only methods that answer from lights look at it.
+          points: which of the model's points `values` are of, in that order, where not all of them; for methods that take any.
           clamp: cut negative light off, as an engine does; "energy": in the way that keeps the total of each frame and channel
             (see `ddprt.fitting.encoding.without_negatives`); False keeps it.
           fade: where trust is low, go over to the mean lightmap, as bright as the measurements are.
@@ -86,10 +89,11 @@ class Model:
         Returns:
           (texels, 3) or (frames, texels, 3) float32, W/m², covered texels in row-major order.
         Raises:
-          UserError: wrong shape, not real numbers, not finite, no such clamp, nothing to fade by, or no lightings where the
-            method asks for them.
+          UserError: wrong shape, not real numbers, not finite, no such clamp, nothing to fade by, no lightings where the method
+            asks for them, or points where it takes no other than all.
         """
-        frames, single = self._frames(values)
+        chosen = None if points is None else self._chosen(points)
+        frames, single = self._frames(values, None if chosen is None else len(chosen))
         if not isinstance(clamp, bool | np.bool_ | str) or clamp not in (True, False, "energy"):
             raise UserError(f'clamp: got {clamp!r}, expected True, False or "energy"')
         if fade and self.yardstick is None:
@@ -98,7 +102,10 @@ class Model:
         told = self._described(lightings, len(frames), single) if isinstance(self.relighter, AsksForLights) else None
         if fade and told is not None:
             raise UserError(f"fade: got True for {self.method}, which answers from lights; leave it out, or fit svd-ridge")
-        light = np.asarray(_relight(self.relighter, self.encoding, frames, told, *self._places, bool(clamp), area))
+        if fade and chosen is not None:
+            raise UserError("fade: got True with points, but trust is measured by all of them; leave one of the two out")
+        places = self._places if chosen is None else (self._places[0][chosen], self._places[1][chosen])
+        light = np.asarray(_relight(self.relighter, self.encoding, frames, told, *places, bool(clamp), area))
         if fade and self.yardstick is not None:
             kept = self.yardstick.kept(self.yardstick.measure(self.encoding, frames).score)[:, None, None]
             scale = np.asarray(self.encoding.scale(frames), np.float64)[:, None]
@@ -126,7 +133,7 @@ class Model:
         known = type(values) is np.ndarray and values.dtype == np.float32
         measured = values if known else _real(values)
         single = measured.ndim == 2
-        self._check_shape(measured)
+        self._check_shape(measured, self.points)
         answer = self._transfer.answer(measured[None] if single else measured)
         if answer is None:
             raise UserError(_NOT_FINITE)
@@ -191,11 +198,30 @@ class Model:
 
         save_model(self, Path(folder))
 
-    def _frames(self, values: Any) -> tuple[Float[Array, "frames points 3"], bool]:
+    def _chosen(self, points: Any) -> np.ndarray:
+        """Which points, as indices.
+
+        Raises:
+          UserError: the method takes all of them or none, or they are no indices of different points.
+        """
+        if not isinstance(self.relighter, TakesAnyPoints):
+            raise UserError(
+                f"points: got some of them, but {self.method} answers from all {self.points}; leave it out, or fit point-set"
+            )
+        chosen = np.asarray(points)
+        fine = chosen.ndim == 1 and len(chosen) > 0 and np.issubdtype(chosen.dtype, np.integer)
+        if not fine or chosen.min() < 0 or chosen.max() >= self.points or len(np.unique(chosen)) < len(chosen):
+            raise UserError(
+                f"points: got {' '.join(repr(points).split())[:60]}, expected different whole numbers from 0 to "
+                f"{self.points - 1}; name each measured point once"
+            )
+        return chosen
+
+    def _frames(self, values: Any, points: int | None = None) -> tuple[Float[Array, "frames points 3"], bool]:
         """Measured light as frames, and whether it was a single one."""
         measured = _real(values)
         single = measured.ndim == 2
-        self._check_shape(measured)
+        self._check_shape(measured, self.points if points is None else points)
         if not np.isfinite(measured).all():
             raise UserError(_NOT_FINITE)
         return jnp.asarray(measured[None] if single else measured), single
@@ -212,9 +238,9 @@ class Model:
         # One without lights is dark.
         return jnp.asarray(self.relighter.describe([one and parse_lighting(one) for one in each]), jnp.float32)  # type: ignore[attr-defined]
 
-    def _check_shape(self, measured: np.ndarray) -> None:
-        if measured.shape[-2:] != (self.points, 3) or measured.ndim not in (2, 3):
-            raise UserError(f"values: got shape {measured.shape}, expected ({self.points}, 3) or (frames, {self.points}, 3)")
+    def _check_shape(self, measured: np.ndarray, points: int) -> None:
+        if measured.shape[-2:] != (points, 3) or measured.ndim not in (2, 3):
+            raise UserError(f"values: got shape {measured.shape}, expected ({points}, 3) or (frames, {points}, 3)")
 
     @cached_property
     def _transfer(self) -> Coefficients:
