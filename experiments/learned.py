@@ -1,13 +1,15 @@
 """Does any learned method beat the linear baseline, under which budget, and on what it was not trained on?
 
-Question: who wins the leagues of bytes, operations and seconds on each scene, and who generalises; does a linear autoencoder find
-          the SVD's subspace, is an interrupted training resumed to the same bits, and how near is training to what the machine can do?
+Question: who wins the leagues of bytes, operations and seconds on each scene, and who generalises; does a linear autoencoder
+          find the SVD's subspace, is an interrupted training resumed to the same bits, and how near is training to what
+          the machine can do?
 Command:  python experiments/learned.py [SCENE ...] [--out runs/learned]      cornell, corridor and statue unless named; goes on
                                                                               where it was stopped; the last line is JSON
           python experiments/learned.py --quick                               tiny data and defaults alone, less than a minute
 Answer:   docs/leagues.md
 
-Torch is compared with where it can be imported (put it on PYTHONPATH); it is no part of ddprt, and the JSON says where it lacks.
+Torch is compared with where it can be imported (put it on PYTHONPATH); it is no part of ddprt, and the JSON says
+where it lacks.
 """
 
 import json
@@ -61,7 +63,7 @@ def config(scene: str, quick: bool) -> Config:
         "leagues": {"trials": 1, "bytes": OPEN, "flops": OPEN, "seconds": 1e9} if quick else {"seconds": 60.0},
     }
     if quick:
-        few = {"steps": 60, "check_every": 20}
+        few = {"steps": 40, "check_every": 20}
         names = ("mlp", "residual", "neural-lightmap", "point-set", "light-network")
         own: dict[str, Any] = {name: few for name in names if name in ddprt.methods.METHODS}
         document["methods"] = {"settings": {**own, "autoencoder": {"steps": 150}, "nonnegative": {"sweeps": 50}}}
@@ -114,7 +116,7 @@ class Stopper:
 
 
 def resumes(data: Dataset, folder: Path) -> bool:
-    """Whether a training that was interrupted comes to the same bits as one that was not, from a checkpoint at its first look."""
+    """Whether a training that was interrupted after its first look comes to the same bits as one that was not."""
     fit = lambda: ddprt.fit(data, "mlp", settings={"steps": 60, "check_every": 20})  # noqa: E731
     try:
         with keeping(folder, Stopper(), every=0):  # type: ignore[arg-type]
@@ -146,7 +148,8 @@ def scene(name: str, folder: Path, quick: bool) -> tuple[dict[str, list[Place]],
         found = told(Generalisation(job.config, data, job.scene, folder / "bench", job.progress).run(names), names)
         write_text(folder / "bench" / "splits.md", markdown(found, name))
     table, files = leagues(job.config, data, job.scene, folder / "bench", job.progress, splits=found)
-    print(files[1].read_text(), flush=True)
+    if not quick:
+        print(files[1].read_text(), flush=True)
     return table, data, [f"{split['name']}: {line}" for split in found for line in split["words"]]
 
 
@@ -174,7 +177,7 @@ def main(words: Sequence[str]) -> None:
             "wins": {name: own["wins"] for name, own in found.items()} if not quick else {},
             "subspace_angle_deg": round(subspace_angle(first, 8), 4),
             "resume_bit_identical": resumes(first, Path(scratch) / "resumed"),
-            **pace(200 if quick else 1000, 3 if quick else 7),
+            **pace(50 if quick else 1000, 3 if quick else 7),
             "seconds": round(time.perf_counter() - begun, 1),
         }
         print(json.dumps(answer))

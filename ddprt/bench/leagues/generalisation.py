@@ -25,6 +25,7 @@ from ddprt.errors import UserError
 from ddprt.files import alone_in, append_line, make_folder
 from ddprt.lights import Lighting
 from ddprt.progress import Progress
+from ddprt.report.metrics import Tally, Truth
 from ddprt.runtime.model import Model
 from ddprt.runtime.precision import stored
 from ddprt.runtime.train import fit_method
@@ -114,9 +115,8 @@ class Generalisation:
     def _measured(self, side: Side, method: str, seed: int) -> Record:
         try:
             model = self._model(side, method, seed)
-            if side.asked:
-                model = asked_with(model, side.asked)
-            return {"failed": None, **parts(self._truth(side).tally(model))}
+            truth = self._truth(side)
+            return {"failed": None, **parts(tally_with(model, truth, side.asked) if side.asked else truth.tally(model))}
         except (UserError, MemoryError) as error:
             return {"failed": why(error)}
 
@@ -186,6 +186,19 @@ def asked_with(model: Model, points: int) -> Model:
     if not getattr(model.relighter, "any_points", False):
         raise UserError(f"{model.method}: takes the {model.points} points that it was fitted with, and no other number")
     return replace(model, points=points)
+
+
+def tally_with(model: Model, truth: Yardstick, points: int) -> Tally:
+    """Errors of a fitted model where all but the first points are gone; those that are left measure what they did before.
+
+    Raises:
+      UserError: its method takes no other number of points.
+    """
+    fewer, found = asked_with(model, points), []
+    for values, index in zip(truth.measured(model), truth.held_out, strict=True):
+        predicted = fewer.predict(values[:points], lightings=truth.data.lightings[index], constant=False)[None]
+        found.append(Truth(truth.data.maps("indirect", [index]), truth.data.area).tally(predicted))
+    return Tally.joined(found)
 
 
 def told(records: Sequence[Record], names: Sequence[str]) -> list[dict[str, Any]]:
