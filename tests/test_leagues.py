@@ -3,12 +3,16 @@
 import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_job import base
+from small_rival import Gain
 
 import ddprt
 from ddprt.bench.leagues import contest
@@ -22,13 +26,14 @@ from ddprt.config import Config
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.methods import METHODS, known_methods
+from ddprt.methods.mlp import Perceptron
 from ddprt.progress import Progress
 from ddprt.runtime.precision import shipped_bytes, stored
 from ddprt.scene.library import SCENES
 from ddprt.sections import LeaguesConfig
 
 QUIET = Progress(quiet=True)
-SMALL = {"leagues__trials": 2, "leagues__seeds": 2, "leagues__methods": ["nonnegative"]}
+SMALL = {"leagues__trials": 2, "leagues__seeds": 2, "leagues__methods": ["gain"]}
 
 
 @pytest.fixture(scope="module")
@@ -200,8 +205,8 @@ def test_a_table_says_who_wins_by_how_much_and_where() -> None:
 
 def test_a_contest_chooses_before_it_looks_and_goes_on(data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config, scene = base(**SMALL), ddprt.load_scene("cornell")
-    for name in (BASELINE, "nonnegative"):  # settings that need nothing compiled
-        monkeypatch.setattr(METHODS[name], "search", {"ridge": ("auto", 1e-5, 1e-3)})
+    monkeypatch.setitem(METHODS, "gain", Gain)
+    monkeypatch.setattr(METHODS[BASELINE], "search", {"ridge": ("auto", 1e-5, 1e-3)})  # needs nothing compiled
     looked: list[str] = []
     real = contest.tally
 
@@ -211,7 +216,7 @@ def test_a_contest_chooses_before_it_looks_and_goes_on(data: Dataset, tmp_path: 
 
     monkeypatch.setattr(contest, "tally", noting)
     records = Contest(config, data, scene, tmp_path, QUIET).run()
-    for name in (BASELINE, "nonnegative"):
+    for name in (BASELINE, "gain"):
         own = [split for method, split in map(str.split, looked) if method == name]
         assert own.count("validation") == 4
         assert 2 <= own.count("test") <= 4  # a trial in three leagues is looked at once
@@ -236,7 +241,7 @@ def test_a_contest_chooses_before_it_looks_and_goes_on(data: Dataset, tmp_path: 
     files = leagues(config, data, scene, tmp_path, QUIET)[1]
     page = files[2].read_text()
     assert not re.search(r'(src|href)="(?!data:|#)', page)
-    assert "Best lighting of nonnegative" in page
+    assert "Best lighting of gain" in page
 
 
 def test_settings_of_a_trial_are_those_it_is_fitted_with(data: Dataset, tmp_path: Path) -> None:
@@ -249,7 +254,8 @@ def test_settings_of_a_trial_are_those_it_is_fitted_with(data: Dataset, tmp_path
     assert np.array_equal(own.model(Trial(BASELINE, 0, {})).relighter.matrix, stored(plain, "half").relighter.matrix)  # type: ignore[attr-defined]
 
 
-def test_a_baseline_that_cannot_be_fitted_is_told(data: Dataset, tmp_path: Path) -> None:
+def test_a_baseline_that_cannot_be_fitted_is_told(data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(METHODS, "gain", Gain)
     wrong: Config = base(**SMALL, fit__bases=1, fit__centre="mean")
     with pytest.raises(UserError, match="baseline that cannot be fitted"):
         Contest(wrong, data, SCENES["cornell"](), tmp_path, QUIET).run()
@@ -257,13 +263,16 @@ def test_a_baseline_that_cannot_be_fitted_is_told(data: Dataset, tmp_path: Path)
 
 def test_maps_are_rounded_and_matrices_are_not(data: Dataset) -> None:
     """Of every method, so that bytes are judged alike; each map keeps its largest value, the others are off by half a step."""
-    model = ddprt.fit(data, "mlp", bases=3, settings={"steps": 1, "width": 8, "depth": 1})
-    rounded, relighter = stored(model, "byte").relighter, model.relighter
-    assert np.array_equal(rounded.weights[0], relighter.weights[0])  # type: ignore[attr-defined]
-    assert np.array_equal(rounded.spread, relighter.spread)  # type: ignore[attr-defined]
-    basis = np.asarray(relighter.basis)  # type: ignore[attr-defined]
-    off, largest = np.abs(np.asarray(rounded.basis) - basis), np.abs(basis).max(1, keepdims=True)  # type: ignore[attr-defined]
+    plain: Any = ddprt.fit(data, BASELINE, bases=4)
+    weights = jax.random.normal(jax.random.key(0), (15, 4))
+    relighter = Perceptron((weights,), (jnp.full(4, 0.1),), plain.relighter.basis, jnp.array([1.0, 0.3, 0.03, 0.003]))
+    model = replace(plain, relighter=relighter)
+    rounded: Any = stored(model, "byte").relighter
+    assert np.array_equal(rounded.weights[0], weights)
+    assert np.array_equal(rounded.spread, relighter.spread)
+    basis = np.asarray(relighter.basis)
+    off, largest = np.abs(np.asarray(rounded.basis) - basis), np.abs(basis).max(1, keepdims=True)
     assert (off <= largest * (0.5 / 127 + 1e-6)).all()  # half a step, and float32's rounding
     assert off.max() > 0
-    assert shipped_bytes(model, "float") - shipped_bytes(model, "byte") == 3 * basis.size - 4 * 3
+    assert shipped_bytes(model, "float") - shipped_bytes(model, "byte") == 3 * basis.size - 4 * 4
     assert shipped_bytes(model, "float") == relighter.nbytes

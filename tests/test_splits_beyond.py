@@ -3,16 +3,20 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from small_job import base
+from small_rival import Gain
 
 import ddprt
-from ddprt.bench.leagues.generalisation import Generalisation, asked_with, markdown, told
+from ddprt.bench.leagues.generalisation import Generalisation, asked_with, markdown, tally_with, told
 from ddprt.bench.leagues.search import BASELINE
 from ddprt.bench.leagues.splits import SPLITS, split_names
 from ddprt.bench.measure.settings import changed
 from ddprt.errors import UserError
 from ddprt.lights import PointLight
+from ddprt.methods import METHODS
+from ddprt.methods.floors import MeanMap
 from ddprt.progress import Progress
 
 QUIET = Progress(quiet=True)
@@ -66,7 +70,8 @@ def test_a_configuration_that_cannot_be_asked_says_why(tmp_path: Path) -> None:
 
 def test_more_lights_are_asked_about_and_noted_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a side asks about is baked and scored apart from its training; a second run has all of it in its file."""
-    config, scene = base(leagues__seeds=2, leagues__methods=["nonnegative"]), ddprt.load_scene("cornell")
+    monkeypatch.setitem(METHODS, "gain", Gain)
+    config, scene = base(leagues__seeds=2, leagues__methods=["gain"]), ddprt.load_scene("cornell")
     data = ddprt.bake(scene, config=config, out=tmp_path / "data")
     first = Generalisation(config, data, scene, tmp_path, QUIET)
     records = first.run(["crowd"])
@@ -77,14 +82,19 @@ def test_more_lights_are_asked_about_and_noted_once(tmp_path: Path, monkeypatch:
     assert len(records) == 2 * 2 * 2
     assert all(len(record["error"]) == 4 for record in records)
     found = told(records, ["crowd"])[0]
-    assert [name for name, _ in found["rows"]] == [BASELINE, "nonnegative"]
+    assert [name for name, _ in found["rows"]] == [BASELINE, "gain"]
     assert found["sides"] == ["1 light, as trained", "4 lights"]
     assert "4 lights: " in found["words"][0]
     model = first._model(sides[0], BASELINE, 0)
     with pytest.raises(UserError, match="the 12 points that it was fitted with"):
         asked_with(model, 6)
-    monkeypatch.setattr(type(model.relighter), "any_points", True, raising=False)
-    assert asked_with(model, 6).points == 6
+    monkeypatch.setattr(MeanMap, "any_points", True, raising=False)
+    mean = first._model(sides[0], "gain", 0)
+    assert asked_with(mean, 6).points == 6
+    # What is left of the points is bright as before, which is all that this rival heeds: with all points nothing changes.
+    whole, fewer = (tally_with(mean, first._truth(sides[0]), points) for points in (12, 6))
+    np.testing.assert_array_equal(whole.error, first._truth(sides[0]).tally(mean).error)
+    assert (whole.error != fewer.error).any()
 
     def never(*_: Any, **__: Any) -> Any:
         raise AssertionError("was measured again")
@@ -93,6 +103,7 @@ def test_more_lights_are_asked_about_and_noted_once(tmp_path: Path, monkeypatch:
     assert Generalisation(config, data, scene, tmp_path, QUIET).run(["crowd"]) == records
 
 
+@pytest.mark.slow
 def test_light_that_does_not_get_in_is_told_and_a_method_that_cannot_too(tmp_path: Path) -> None:
     """A closed box has no parallel light from above."""
     config = base(leagues__seeds=1, leagues__methods=["sh-prt"], lightings__elevation_deg=[80, 90])
