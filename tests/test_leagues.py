@@ -224,6 +224,8 @@ def test_a_contest_chooses_before_it_looks_and_goes_on(data: Dataset, tmp_path: 
     tests = [record["digest"] for record in records if record["what"] == "test"]
     assert len(set(tests)) == len(tests)
     table, budgets = judged(records, config)
+    picked = [trial["digest"] for places in table.values() for place in places for trial in place.trials]
+    assert set(tests) == set(picked)
     for league, places in table.items():
         for place in places:
             assert all(own[league] <= getattr(budgets, league) for own in place.trials)
