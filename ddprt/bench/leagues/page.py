@@ -93,9 +93,11 @@ def write_pages(
 
 
 def leader(table: Mapping[str, Sequence[Place]]) -> Place | None:
-    """The best rival of the first league that has one."""
-    rivals = (place for places in table.values() for place in places if place.difference is not None)
-    return next(rivals, None)
+    """The first rival that beats the baseline in a league, else the best of the first league that has one."""
+    rivals = [place for places in table.values() for place in places if place.difference is not None]
+    return next(
+        (place for place in rivals if place.difference and place.difference.verdict == "better"), next(iter(rivals), None)
+    )
 
 
 def pictures_of(place: Place, base: Model, own: Model, data: Dataset, scene: Scene) -> list[Shown]:

@@ -34,7 +34,7 @@ def rows(places: Sequence[Place]) -> list[tuple[str, ...]]:
     told: list[tuple[str, ...]] = []
     for place in places:
         if not place.errors:
-            told.append((place.method, "out", "–", place.why, "–", "–", "–", "–", ""))
+            told.append((place.method, *("–",) * 2, "out", *("–",) * 4, place.why))
             continue
         largest = {key: max(trial[key] for trial in place.trials) for key in LEAGUES}
         frame = max(test["frame"]["median"] for test in place.tests)
