@@ -39,8 +39,8 @@ from ddprt.runtime.train import fit_config
 
 def budget_closure(folder: Path, quick: bool) -> float:
     """Sum of the parts' squares over the squared total, of a small Cornell box."""
-    more = {"budget": {"lightings": 32 if quick else 128, "abundance": 2 if quick else 4, "noise": 0.01, "turn": False}}
-    base = config("cornell", 32 if quick else 64, 32 if quick else 64, **more)
+    more = {"budget": {"lightings": 24 if quick else 128, "abundance": 2 if quick else 4, "noise": 0.01, "turn": False}}
+    base = config("cornell", 32 if quick else 64, 24 if quick else 64, **more)
     job = Run(base, folder, quiet=True)
     data = job.bake()
     bakery = Bakery(job.scene, base, data, folder / "budget", QUIET)

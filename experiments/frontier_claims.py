@@ -51,9 +51,8 @@ def measured(scene: str, folder: Path) -> tuple[list[Tally], np.ndarray]:
     for place in (
         (*search.base[:1], train, noise, points) for train in knobs[1] for noise in knobs[2][::-1] for points in knobs[3]
     ):
-        setting = search.setting(Plan(place, max(QUICK_BASES), "float"))
-        data, _ = contest.workshop.bake(setting)
-        model, _ = search._fit(setting, data)
+        fitted = search.fitted(Plan(place, max(QUICK_BASES), "float"))
+        model, data = fitted.model, fitted.data
         most = model.relighter.report.bases
         found += [pool.tally(stored(without_last(model, most - count), "half")) for count in QUICK_BASES if count <= most]
         if place == search.base:

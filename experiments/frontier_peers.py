@@ -19,8 +19,8 @@ QUICK_RELIGHT = (OURS, "numpy B.T @ u.T, into an array")
 
 
 def quick_peers(base: Config) -> dict[str, float | None]:
-    """The fit of a twentieth of the texels and cold frames, beside the fastest accurate peers of the whole comparison alone."""
-    sizes = Sizes(texels=50_000, repeats=3)
+    """The fit of a fiftieth of the texels and cold frames, beside the fastest accurate peers of the whole comparison alone."""
+    sizes = Sizes(texels=20_000, repeats=3)
     with threadpool_limits(limits=roofline.threads()):
         spectrum = fit.real_spectrum(base, 3 * sizes.lightings, QUIET)
         maps = fit.Maps(fit.make_columns(spectrum, sizes.texels, base.seed), sizes.bases)

@@ -25,6 +25,7 @@ from ddprt.bench.measure.settings import Setting
 from ddprt.bench.measure.trial import Workshop, environment, measured_here, why
 from ddprt.bench.measure.yardstick import Yardstick, make_yardstick
 from ddprt.bench.tune.curves import time_of_frame
+from ddprt.bench.tune.fitted import Fitted
 from ddprt.bench.tune.held_out import spread_of
 from ddprt.bench.tune.outcome import Doubt
 from ddprt.bench.tune.planner import Guess, Place, Plan, Trial, seconds
@@ -37,7 +38,6 @@ from ddprt.progress import Progress
 from ddprt.report.metrics import Tally
 from ddprt.runtime.model import Model
 from ddprt.runtime.precision import shipped_bytes, stored
-from ddprt.runtime.train import fit_config
 
 QUIET = Progress(quiet=True)
 UPPER = {"region_low": [0.1, 0.5, 0.1], "region_high": [0.9, 0.8, 0.9], "clearance": 0.1}
@@ -108,6 +108,7 @@ class Contest:
         self.key = [Setting({}, self.base).digest, self.workshop.truth, [entry.name for entry in fields(Trial)], clock]
         self.barred: dict[Place, str] = {}
         self._fresh_tallies: dict[Plan, Tally] = {}
+        self._fits: dict[tuple[Place, int], Fitted] = {}
 
     @cached_property
     def expected(self) -> float:
@@ -159,7 +160,7 @@ class Contest:
             assert known is not None
             return found.scored_again(known[place]) if found.held_out.seconds else known[place]
 
-        found = Search(asked, self.workshop, self.factors, told if known else None, expected)
+        found = Search(asked, self.workshop, self.factors, told if known else None, expected, self._fits)
         if self.quick:
             found.bases = found.planner.bases = QUICK_BASES
         return found
@@ -280,13 +281,10 @@ class Contest:
         return float(getattr(known[doubt.plan.place], doubt.quantity))
 
     def _model(self, search: Search, plan: Plan) -> Model:
-        setting = search.setting(plan)
-        return stored(fit_config(self.workshop.bake(setting)[0], setting.config, "svd-ridge"), plan.precision)
+        return stored(search.fitted(plan).model, plan.precision)
 
     def _frame_us(self, search: Search, plan: Plan) -> float:
-        data, model = self.workshop.bake(search.setting(plan))[0], self._model(search, plan)
-        values = data.values(data.split("train")[:1], model.points, model.quantity)[0]
-        return time_of_frame(model, values, limit=search.limits["frame_us"])[0]
+        return time_of_frame(self._model(search, plan), search.fitted(plan).values, limit=search.limits["frame_us"])[0]
 
     def _tally(self, search: Search, plan: Plan) -> Tally:
         """Errors of a plan on fresh lightings."""

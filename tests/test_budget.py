@@ -63,17 +63,19 @@ class Workshop:
         self.folder = folder
         self.made: dict[str, tuple[Budget, Model, Bakery]] = {}
 
+    def bakery(self, **settings: Any) -> tuple[Run, Bakery]:
+        """A run that was baked and where its budget is baked; nothing is fitted yet."""
+        config = load_config(None, SMALL | {key.replace("__", "."): str(value) for key, value in settings.items()})
+        baked = config.digest("atlas", "lightings", "points", "transport")
+        run = Run(config, self.folder / baked, quiet=True)
+        apart = f"budget-{config.seed}-{config.points.choose}-{bool(config.lightings.file)}"  # whose bakes are others
+        return run, Bakery(run.scene, config, run.bake(), self.folder / apart, run.progress)
+
     def __call__(self, **settings: Any) -> tuple[Budget, Model, Bakery]:
-        overrides = SMALL | {key.replace("__", "."): str(value) for key, value in settings.items()}
-        key = json.dumps(overrides, sort_keys=True)
+        key = json.dumps({name: str(value) for name, value in settings.items()}, sort_keys=True)
         if key not in self.made:
-            config = load_config(None, overrides)
-            baked = config.digest("atlas", "lightings", "points", "transport")
-            run = Run(config, self.folder / baked, quiet=True)
-            data = run.bake()
-            model = run.fit(data)[0][config.fit.method]
-            apart = f"budget-{config.seed}-{config.points.choose}-{bool(config.lightings.file)}"  # whose bakes are others
-            bakery = Bakery(run.scene, config, data, self.folder / apart, run.progress)
+            run, bakery = self.bakery(**settings)
+            model = run.fit(bakery.data)[0][bakery.config.fit.method]
             self.made[key] = measure_budget(model, bakery), model, bakery
         return self.made[key]
 
@@ -305,9 +307,9 @@ def test_knobs_that_bake(workshop: Workshop) -> None:
 
 def test_points_chosen_by_lightings_are_taken_apart(workshop: Workshop) -> None:
     """Every bake of the budget measures at the points that the run's training lightings chose, and at no others."""
-    even = workshop()[2].data
-    budget, _, bakery = workshop(points__choose="qr", budget__scenario="{region_low = [0.1, 0.05, 0.1]}", budget__abundance=2)
-    yard, own = budget.yardsticks, bakery.data
+    even = workshop.bakery()[1].data
+    _, bakery = workshop.bakery(points__choose="qr", budget__scenario="{region_low = [0.1, 0.05, 0.1]}", budget__abundance=2)
+    yard, own = bakery.yardsticks(), bakery.data
     assert own.samples.digest != even.samples.digest
     assert yard.elsewhere is not None
     for other in (yard.clean, yard.truth, yard.elsewhere):
@@ -321,7 +323,7 @@ def test_points_chosen_by_lightings_are_taken_apart(workshop: Workshop) -> None:
     assert [yard.clean.lightings[i] for i in yard.clean.split("validation")] == [
         own.lightings[i] for i in own.split("validation")
     ]
-    assert len(budget.lightings) == 12
+    assert len(yard.clean.split("test")) == 12
     # Maps and measurements belong together: those of a training lighting are those of the run, but for what noise they have.
     there, here = yard.clean.measured([0]), own.measured([0])
     np.testing.assert_array_equal(there, here)
@@ -346,17 +348,28 @@ def listed(path: Path, lightings: list[Any]) -> str:
     return str(path)
 
 
-def test_lightings_of_a_file_are_taken_apart(workshop: Workshop, tmp_path: Path) -> None:
-    """On those that the file holds out; the best transfer is fitted on them and on those of validation, and none is drawn."""
-    clean = workshop()[0].yardsticks.clean
-    kept = listed(tmp_path / "lamps.json", [*clean.lightings[: 24 + 5 + 12]])
-    words = {"lightings__file": kept, "lightings__validation": 5, "lightings__test": 12, "fit__points": 16}
-    budget, model, bakery = workshop(**words)
-    yard, own = budget.yardsticks, bakery.data
-    assert budget.lightings == [own.lightings[index] for index in own.split("test")]
+def of_a_file(workshop: Workshop, folder: Path) -> dict[str, Any]:
+    """Settings of a run whose lightings are listed: those of the plain one, of which more are held out."""
+    clean = workshop.bakery()[1].yardsticks().clean
+    kept = listed(folder / "lamps.json", [*clean.lightings[: 24 + 5 + 12]])
+    return {"lightings__file": kept, "lightings__validation": 5, "lightings__test": 12, "fit__points": 16}
+
+
+def test_lightings_of_a_file_are_those_that_it_holds_out(workshop: Workshop, tmp_path: Path) -> None:
+    """The best transfer is fitted on them and on those of validation, and none is drawn."""
+    _, bakery = workshop.bakery(**of_a_file(workshop, tmp_path))
+    yard, own = bakery.yardsticks(), bakery.data
+    held_out = [own.lightings[index] for index in own.split("test")]
+    assert [yard.clean.lightings[index] for index in yard.clean.split("test")] == held_out
     assert len(yard.clean.split("train")) == yard.train == 24
     fitted = [data.lightings[index] for data, indices in yard.unseen() for index in indices]
     assert fitted == [own.lightings[index] for split in ("validation", "test") for index in own.split(split)]
+
+
+@pytest.mark.slow
+def test_lightings_of_a_file_are_taken_apart(workshop: Workshop, tmp_path: Path) -> None:
+    budget, model, bakery = workshop(**of_a_file(workshop, tmp_path))
+    assert budget.lightings == [bakery.data.lightings[index] for index in bakery.data.split("test")]
     shares = budget.parts.record()
     assert sum(part["share"] for part in shares["parts"]) + sum(pair["share"] for pair in shares["cross_terms"]) == (
         pytest.approx(1, abs=1e-10)

@@ -18,17 +18,17 @@ from small_job import base, call
 
 import ddprt
 import ddprt.transport
-from ddprt.bench.effects.ablation import Variant, counterparts, variants
+from ddprt.bench.effects.ablation import Variant, _row, counterparts, variants
 from ddprt.dataset.generate import bake
 from ddprt.errors import UserError
 from ddprt.lights import LIGHTS, Lighting, parse_lighting
 from ddprt.pipeline import Run, _effects
-from ddprt.progress import Progress
+from ddprt.progress import Doubt, Progress
 from ddprt.scene.atlas import build_atlas
 from ddprt.scene.checks import checked
 from ddprt.scene.files import load_scene
 from ddprt.scene.library import SCENES, build
-from ddprt.scene.material import Material
+from ddprt.scene.material import Emission, Gloss, Material
 from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import box, faceted, icosphere, rectangle
 from ddprt.sections import EffectsConfig, LightingsConfig
@@ -486,6 +486,30 @@ def test_what_an_effect_changes_is_told_in_light_rays_and_seconds(rows: tuple[Pa
     text = (folder / "effects.md").read_text()
     assert [line.split(" | ")[0].removeprefix("| ") for line in text.splitlines()[2:]] == list(found)
     assert "| 100.00% |" in text
+
+
+def test_of_white_walls_paths_say_that_light_never_dies_and_nothing_else(tmp_path: Path) -> None:
+    """Where an albedo is 1, rough gloss that is left out has no bound either, which the plan tells."""
+    white = build("plates").made_of(lambda material: replace(material, albedo=(1.0,) * 3, gloss=Gloss(1.0)))
+    lamp = parse_lighting({"type": "point", "position": [0, 0.5, 0], "intensity": [1, 1, 1]})
+    assert [effect.name for effect in plan(white, [lamp]).effects if effect.bound is None] == ["diffuse bounces", "gloss"]
+    config = base(atlas__resolution=24, points__count=4, transport__integrator="paths", transport__samples=2)
+    with pytest.warns(Doubt) as told:
+        bake(white, [lamp] * 3, config=config, out=tmp_path / "data")
+    started = [str(line.message).split(":")[0] for line in told]
+    assert [name for name in started if name in EFFECTS] == ["diffuse bounces"]
+
+
+def test_changes_have_no_share_of_lamps_that_light_nothing(tmp_path: Path) -> None:
+    """A sky outside of a closed room that glows: what glowing changes is no share of the direct light, rather than 0 of it."""
+    room = build("furnace", subdivisions=2).made_of(lambda material: replace(material, emission=Emission((1.0, 1.0, 1.0))))
+    sky = parse_lighting({"type": "environment", "image": "white"})
+    lightings = {"train": [CENTRE], "validation": [CENTRE], "test": [sky]}
+    config = base(atlas__resolution=24, points__count=4)
+    planned = bake(room, lightings, config=config, out=tmp_path / "planned")
+    dull = bake(force(room, off=["emission"]), lightings, config=config, out=tmp_path / "dull")
+    told = _row(Variant("without emission", "emission", -1), room, [sky], planned, dull, 1.0, 0, "")
+    assert (told.largest_change, told.relative_rmse, told.energy_share) == (None, 1.0, 1.0)
 
 
 def test_variants_are_what_can_be_left_out(cornell: Scene) -> None:

@@ -25,7 +25,10 @@ from ddprt.scene.mesh import Scene
 DOCS = Path(__file__).parent.parent / "docs" / "effects.md"
 EPS = float(np.finfo(np.float32).eps)
 ORDER, PLACES, POINTS = 4, 90, 16
-OPTIONS: list[dict[str, Any]] = [{}, {"channels": "multi", "centre": "mean", "space": "gamma"}]
+OPTIONS: list[Any] = [
+    pytest.param({}, marks=pytest.mark.slow),
+    {"channels": "multi", "centre": "mean", "space": "gamma"},
+]
 
 
 @pytest.fixture(scope="module")

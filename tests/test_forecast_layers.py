@@ -33,10 +33,10 @@ def glowing(name: str) -> Scene:
     ("scene", "side", "transport", "probes"),
     [
         ("cornell", 48, {"samples": 32}, {"grid": [3, 3, 3], "rays": 128}),
-        ("neon", 64, {"test_samples": 64}, {"grid": [3, 2, 3], "rays": 128}),
+        pytest.param("neon", 64, {"test_samples": 64}, {"grid": [3, 2, 3], "rays": 128}, marks=pytest.mark.slow),
         ("neon", 64, {"test_samples": 64, "bounces": 0}, {}),
         ("neon", 48, {"test_samples": "auto", "target_noise": 0.02}, {}),
-        ("statue", 64, {"bounces": 1}, {"grid": [3, 3, 3], "rays": "auto"}),
+        pytest.param("statue", 64, {"bounces": 1}, {"grid": [3, 3, 3], "rays": "auto"}, marks=pytest.mark.slow),
         ("glossy-room", 48, {"samples": 4, "test_samples": 8}, {"grid": [2, 2, 2], "rays": 128}),
     ],
 )

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,12 @@ from ddprt.bench.measure.settings import Setting
 from ddprt.bench.measure.trial import Workshop
 from ddprt.bench.measure.yardstick import Yardstick
 from ddprt.bench.tune import held_out as module
-from ddprt.bench.tune.held_out import Fitted, HeldOut, error_of, spread_of
+from ddprt.bench.tune import search as tuning
+from ddprt.bench.tune.fitted import Fitted
+from ddprt.bench.tune.held_out import HeldOut, error_of, spread_of
 from ddprt.bench.tune.planner import Plan, Planner
 from ddprt.bench.tune.search import Search
-from ddprt.bench.tune.suspects import draw_candidates, unknown
+from ddprt.bench.tune.suspects import draw_candidates, measured, unknown
 from ddprt.config import Config
 from ddprt.lights import lighting_json, parse_lighting
 from ddprt.progress import Progress
@@ -41,7 +44,7 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Workshop:
 def fitted(workshop: Workshop) -> Fitted:
     data, _ = workshop.bake(Setting({}, base()))
     model = fit_config(data, base(), "svd-ridge")
-    return lambda: (model, data)
+    return Fitted(model, data, {}, 0.0)
 
 
 def drawn(held_out: HeldOut) -> list[str]:
@@ -53,8 +56,10 @@ def test_each_time_there_are_more_of_the_same_density(workshop: Workshop, fitted
     held_out = HeldOut(workshop)
     assert held_out.count == 4
     first = drawn(held_out)
-    assert held_out.more(fitted, 0.5, 0.0), "the first doubling is never too dear"
-    assert not held_out.more(fitted, 0.5, 0.0), "the second is"
+    assert not held_out.more(lambda: pytest.fail("asked for"), 0.5, 1.9, 2, lambda count, noise: 0.5 * count), "expected: 2 s"
+    assert (held_out.seconds, held_out.count) == (0, 4)
+    assert held_out.more(lambda: fitted, 0.5, 0.0), "what nobody expects anything of is not too dear"
+    assert not held_out.more(lambda: fitted, 0.5, 0.0), "the second is"
     assert held_out.count == 8
     assert held_out.more(lambda: pytest.fail("drawn for another model"), 0.5, 1e9, 3)
     assert held_out.count == 24
@@ -63,13 +68,15 @@ def test_each_time_there_are_more_of_the_same_density(workshop: Workshop, fitted
     candidates = json.loads(next(workshop.folder.glob("truth-*-candidates/lightings.json")).read_text())
     assert {*drawn(held_out)[4:]} < {repr(parse_lighting(each)) for each in candidates}
     again = HeldOut(workshop)
-    assert again.more(fitted, 0.5, 0.0)
+    assert again.more(lambda: fitted, 0.5, 0.0)
     assert drawn(again) == drawn(held_out)[:8]
     took = [
         json.loads(next(workshop.folder.glob(f"truth-*-{what}/took.json")).read_text())["seconds"]
-        for what in ("candidates", "0-4-*")
+        for what in ("candidates", "candidates-*", "0-4-*")
     ]
-    assert again.seconds == sum(took) < held_out.seconds, "what lay there is told as it was baked"
+    assert again.seconds == pytest.approx(sum(took)), "what lay there is told as it was baked"
+    assert again.seconds < held_out.seconds
+    assert all(took)
 
 
 def test_their_maps_are_as_fine_as_a_tenth_of_the_limit_asks(
@@ -83,16 +90,19 @@ def test_their_maps_are_as_fine_as_a_tenth_of_the_limit_asks(
 
     monkeypatch.setattr(module, "make_yardstick", note)
     for limit, noise in ((0.5, 0.3), (4.0, 0.4), (100.0, 1.0)):  # the configuration's is 0.3
-        assert HeldOut(workshop).more(fitted, limit, 0.0)
+        assert HeldOut(workshop).more(lambda: fitted, limit, 0.0)
         assert asked[-1].bench.noise == noise
 
 
 def test_errors_are_pooled_over_all_of_them_by_what_each_counts_for(workshop: Workshop, fitted: Fitted) -> None:
-    model, data = fitted()
+    model, data = fitted.model, fitted.data
     held_out = HeldOut(workshop)
     few = held_out.tally(model)
     assert held_out.spread(few) == spread_of(few, 2.0)
-    held_out.more(fitted, 0.5, 0.0)
+    held_out.more(lambda: fitted, 0.5, 0.0)
+    told = {workshop.yardstick: replace(few, error=0 * few.error)}
+    assert not held_out.tally(model, told).error[:4].any(), "what was told is not asked for again"
+    assert set(told) == {workshop.yardstick, held_out._more[0]}
     tally, other = held_out.tally(model), held_out._more[0].tally(model)
     # Four drawn evenly and four by a density: each counts 8 / (4 + 4 d), d by what the model's own points measure.
     candidates = [parse_lighting(each) for each in json.loads(next(workshop.folder.glob("*-candidates/*s.json")).read_text())]
@@ -100,6 +110,7 @@ def test_errors_are_pooled_over_all_of_them_by_what_each_counts_for(workshop: Wo
     average = unknown(np.stack([model.measure(each) for each in candidates]), known).mean()
     yardsticks = workshop.yardstick, held_out._more[0]
     lightings = [each.data.lightings[index] for each in yardsticks for index in each.held_out]
+    np.testing.assert_array_equal(measured(model, candidates), np.stack([model.measure(each) for each in candidates]))
     density = 0.2 + 0.8 * unknown(np.stack([model.measure(each) for each in lightings]), known) / average
     weight = 8 / (4 + 4 * density)
     assert tally.error == pytest.approx(weight * np.concatenate([few.error, other.error]), rel=1e-6)
@@ -134,7 +145,11 @@ def test_what_was_tried_is_scored_on_all_before_another_bake(workshop: Workshop,
 
     monkeypatch.setattr(Planner, "replace", note)
     monkeypatch.setattr(Planner, "undecided", lambda planner, plan: not seen and isinstance(plan, Plan))
+    fits: list[int] = []
+    monkeypatch.setattr(tuning, "fit_config", lambda data, config, name: fits.append(1) or fit_config(data, config, name))
     outcome = search.run()
+    assert len(fits) == 2 * len(search._fits), "each setting once, and once before that is not timed"
+    assert search.fitted(outcome.plan) is search._fits[outcome.plan.place, outcome.plan.bases]
     assert outcome.held_out == search.held_out.count == 16, "so near, twice as many are not likely to tell"
     (trial,) = seen
     model = fit_config(workshop.bake(Setting({}, base()))[0], base(fit__bases=trial.bases[-1]), "svd-ridge")

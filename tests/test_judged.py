@@ -40,7 +40,9 @@ def test_held_out_lightings_that_no_point_sees_are_said(method: str) -> None:
 
 
 @METHOD
-@pytest.mark.parametrize("factor", [1e-25, 1e-3, 1e3, 1e25])
+@pytest.mark.parametrize(
+    "factor", [1e-25, pytest.param(1e-3, marks=pytest.mark.slow), pytest.param(1e3, marks=pytest.mark.slow), 1e25]
+)
 def test_validation_in_other_units_than_training_is_not_ok(method: str, factor: float) -> None:
     measured, indirect = room()
     measured[HELD_BACK] *= np.float32(factor)

@@ -55,7 +55,7 @@ def angle(one: Any, other: Any, train: Examples) -> float:
     return float(np.degrees(subspace_angles(*spaces).max()))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_an_autoencoder_finds_the_subspace_of_the_svd(seed: int) -> None:
     """Within 1 degree from any start; the same light, and vectors that are orthonormal."""
     train, held = examples(1), examples(2, 12)
@@ -104,6 +104,7 @@ def test_a_residual_network_that_is_worth_nothing_is_shut_out() -> None:
     np.testing.assert_array_equal(shut.predict(held.frame), base.predict(held.frame))
 
 
+@pytest.mark.slow
 def test_a_gate_is_the_best_share(monkeypatch: pytest.MonkeyPatch) -> None:
     """Errors at a little more and a little less are no smaller on the validation lightings."""
     train, held = examples(1, 200, bend=0.5), examples(2, 60, bend=0.5)

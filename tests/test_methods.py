@@ -12,6 +12,7 @@ import ddprt
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.methods import METHODS
+from ddprt.methods.learned import Learned
 from ddprt.methods.method import STATUSES, Frame
 from ddprt.runtime import model as runtime
 from ddprt.runtime.model import Model
@@ -27,6 +28,15 @@ VARIANTS = {
     "mean gamma multi": {"centre": "mean", "space": "gamma", "channels": "multi"},
 }
 EPS32 = float(np.finfo(np.float32).eps)
+
+
+def case(method: str, variant: str) -> object:
+    """Training takes seconds: of methods that are trained, one variant is in the fast suite."""
+    long = issubclass(METHODS[method], Learned) and variant != "plain"
+    return pytest.param((method, variant), id=f"{method}-{variant}", marks=[pytest.mark.slow] if long else [])
+
+
+CASES = [case(method, variant) for method in METHODS for variant in VARIANTS]
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +62,7 @@ def data(cornell: Scene) -> Dataset:
     return ddprt.bake(cornell, config=config)
 
 
-@pytest.fixture(scope="module", params=[(m, v) for m in METHODS for v in VARIANTS], ids=lambda p: f"{p[0]}-{p[1]}")
+@pytest.fixture(scope="module", params=CASES)
 def model(request: pytest.FixtureRequest, data: Dataset) -> Model:
     return fitted(*request.param, data)
 
@@ -161,12 +171,12 @@ DISTINCT = 5
 """Points that are left when all from the fifth on measure the same light: fewer than the six bases asked for."""
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("named", CASES)
 def test_duplicated_points_are_lawful(
-    method: str, variant: str, data: Dataset, light: tuple[np.ndarray, np.ndarray], values: np.ndarray
+    named: tuple[str, str], data: Dataset, light: tuple[np.ndarray, np.ndarray], values: np.ndarray
 ) -> None:
     """Twenty points of one light, and no ridge: nothing but the rank cut stands between rounding and the result."""
+    method, variant = named
     measured = light[0].copy()
     measured[:, DISTINCT:] = measured[:, DISTINCT - 1 : DISTINCT]
     twins = told(data, measured, light[1])
@@ -185,13 +195,13 @@ def test_duplicated_points_are_lawful(
     assert ours <= floor * (1 + 1e-5) or report.status != "ok"
 
 
-@pytest.mark.parametrize("variant", ["plain", "mean gamma multi"])
-@pytest.mark.parametrize("method", METHODS)
-def test_a_single_training_lighting_is_lawful(method: str, variant: str) -> None:
+@pytest.mark.parametrize("named", [case(method, variant) for method in METHODS for variant in ("plain", "mean gamma multi")])
+def test_a_single_training_lighting_is_lawful(named: tuple[str, str]) -> None:
     """Who has bases to fill says that one lighting does not; who says nothing gives that lighting back.
 
     The room is that of the catalogue's case "one lighting", so that nothing compiles twice.
     """
+    method, variant = named
     measured, indirect = room(train=1)
     model = fitted(method, variant, make_data(measured, indirect))
     assert_lawful(model, measured[1:])

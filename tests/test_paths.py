@@ -78,7 +78,10 @@ def bare(cornell: Scene) -> Scene:
 # --- closed forms -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("albedo", "samples"), [(0.0, 8), (0.2, 64), (0.5, 128), (0.9, 48)])
+@pytest.mark.parametrize(
+    ("albedo", "samples"),
+    [(0.0, 8), pytest.param(0.2, 64, marks=pytest.mark.slow), (0.5, 128), pytest.param(0.9, 48, marks=pytest.mark.slow)],
+)
 def test_furnace(albedo: float, samples: int) -> None:
     """A closed uniform mesh: mean indirect F / A * a / (1 - a), whatever its facets."""
     scene = build("furnace", albedo=albedo, subdivisions=3)
@@ -123,7 +126,7 @@ def test_colours_of_the_furnace_do_not_mix() -> None:
 # --- against the reference --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["bare", "corridor", "cornell"])
+@pytest.mark.parametrize("name", ["cornell", *(pytest.param(name, marks=pytest.mark.slow) for name in ("bare", "corridor"))])
 def test_agrees_with_the_reference_texel_by_texel(name: str, request: pytest.FixtureRequest) -> None:
     scene = request.getfixturevalue(name)
     atlas = build_atlas(scene, 64)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ddprt.bench.measure.timing import Timing
-from ddprt.bench.peers import fit, peers, relight, ridge, roofline
+from ddprt.bench.peers import fit, peers, relight, ridge, roofline, standing
 from ddprt.bench.peers.fit import EPS, Maps, centred, fit_rows, make_columns
 from ddprt.bench.peers.relight import learned, make_frames, make_model, make_scenes, relight_rows, transfer_rows
 from ddprt.bench.peers.ridge import Pairs, make_pairs, ridge_rows
@@ -70,8 +70,28 @@ def test_columns_have_the_spectrum_and_no_mean() -> None:
     assert (make_columns(spectrum, 300, 1) != make_columns(spectrum, 300, 2)).any()
 
 
-def test_every_way_to_a_basis_is_the_same_way(maps: Maps) -> None:
+SOME = (
+    OURS,
+    "numpy.linalg.svd",
+    "scipy.linalg.svd, gesdd",
+    "scipy.linalg.svd, gesdd, float32",
+    "scipy.sparse.linalg.svds",
+    "NumPy Gram product",
+    "sklearn PCA, covariance_eigh",
+    "sklearn randomized_svd",
+)
+"""One of each kind: ours, whole decompositions, single precision, iterations, a yardstick, one that subtracts the mean, one
+that is told how hard to try."""
+
+
+@pytest.mark.parametrize("some", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_every_way_to_a_basis_is_the_same_way(some: bool, maps: Maps, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(standing, "_REST", 0.0)  # nobody is timed here
+    monkeypatch.setattr(standing, "_WARM", 1)
+    if some:
+        monkeypatch.setattr(fit, "PEERS", [peer for peer in fit.PEERS if peer.name in SOME])
     rows = fit_rows(maps, repeats=1, limit=60)
+    assert len(rows) == (len(SOME) if some else len(fit.PEERS))
     found = {row.name: row for row in rows}
     assert rows[0].verdict == "ours"
     # Single precision is off by eps sigma_1, 400 times as much of the 6th value: less accurate, whatever its time.

@@ -63,9 +63,7 @@ def slow_unless(fast: Sequence[tuple[object, ...]], *choices: Sequence[object]) 
     return [pytest.param(*one, marks=[] if one in fast else [pytest.mark.slow]) for one in itertools.product(*choices)]
 
 
-WAYS = slow_unless(
-    [("linear", "mono", "none"), ("gamma", "multi", "mean")], ["linear", "gamma"], ["mono", "multi"], ["none", "mean"]
-)
+WAYS = slow_unless([("gamma", "multi", "mean")], ["linear", "gamma"], ["mono", "multi"], ["none", "mean"])
 
 
 @pytest.mark.usefixtures("small_blocks")
@@ -144,7 +142,7 @@ def deep(columns: int, entries: int, depth: float) -> np.ndarray:
 
 
 BLOCKS = slow_unless(
-    [(4 * 1024 + 77, 1e-8, True), (900, 1e-2, True)],
+    [(4 * 1024 + 77, 1e-8, True)],
     [5 * 1024, 4 * 1024 + 77, 900],
     [1e-2, 1e-8],
     [False, True],
@@ -157,7 +155,7 @@ def test_blocks_do_not_change_a_bit(entries: int, depth: float, centre: bool, mo
     weights = jnp.asarray(np.random.default_rng(1).random(entries, np.float32) / entries)
     asked: list[Basis] = [fit_basis(jnp.asarray(columns), weights, bases=16, centre=centre)]
     assert (bases._deep(np.asarray(asked[0].singular_values)) is not None) == (depth < 1e-7)
-    asked += [fit_basis(Sliced(columns, tiles), weights, bases=16, centre=centre) for tiles in (1, 2, 9)]
+    asked += [fit_basis(Sliced(columns, tiles), weights, bases=16, centre=centre) for tiles in (2, 9)]
     monkeypatch.setattr(bases, "_BLOCK", 3 * 1024 * 40 * 4)
     asked.append(fit_basis(jnp.asarray(columns), weights, bases=16, centre=centre))
     for other in asked[1:]:

@@ -180,11 +180,12 @@ class _Bake:
             lightings = [lighting for _, lighting in entries]
         effects = plan(self.scene, lightings, bounces=self.config.transport.bounces, probes=self.config.probes.asked)
         description = self._description(entries, effects, drawn, samples)
-        if description["transport"]["integrator"] != "operator" or effects.called("emission"):
+        bounces = next(effect for effect in effects.effects if effect.name == "diffuse bounces")
+        operator = description["transport"]["integrator"] == "operator"  # which tells what it left out, if anything
+        if not operator or effects.called("emission"):
             refuse_filled(self.scene, "transport.integrator" if not effects.called("emission") else "emission")
-        if description["transport"]["integrator"] != "operator":  # which tells what it left out, if anything
-            for effect in (effect for effect in effects.effects if effect.bound is None and not effect.forced):
-                self.progress.warn(f"{effect.name}: {effect.why}")
+        if bounces.bound is None and not bounces.forced and not operator:  # what else has no bound stands in the plan
+            self.progress.warn(f"{bounces.name}: {bounces.why}")
         if there is None:
             (self.folder / "manifest.jsonl").unlink(missing_ok=True)  # it tells of a dataset that nobody knows any more
             store.write_description(self.folder, description)

@@ -9,6 +9,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 from itertools import islice
 from threading import Lock
 from typing import Any, TypeVar
@@ -134,7 +135,7 @@ class Tracer:
         A position counts as free when less than half of the surfaces it sees along 256 spread rays show their backs. The
         radius is exact.
         """
-        directions = warp.sample_sphere(warp.sobol(_PROBES, 2, seed=1))
+        directions = _probes()
         origins = np.repeat((positions - self.centre).astype(np.float32), _PROBES, 0)
         hits = self.closest(origins, np.tile(directions, (len(positions), 1)))
         hit = (hits.triangle >= 0).reshape(-1, _PROBES)
@@ -160,6 +161,14 @@ class Tracer:
                 waiting += [pool.submit(work, item) for item in islice(source, 1)]
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
+
+
+@cache
+def _probes() -> Float32[np.ndarray, "rays 3"]:
+    """Directions that are spread all around."""
+    directions = warp.sample_sphere(warp.sobol(_PROBES, 2, seed=1))
+    directions.flags.writeable = False
+    return directions
 
 
 def lifted(tracer: Tracer, positions: Any, normals: Any) -> Float32[np.ndarray, "n 3"]:

@@ -25,7 +25,7 @@ from ddprt.compiled import compiled
 SMOOTHEST = 0.05
 """Least roughness: the lobe is then half as wide as the sun. Anything smoother is a mirror to light from lamps without size."""
 
-LOSS = {0.1: 0.0004, 0.2: 0.005, 0.3: 0.023, 0.4: 0.06, 0.5: 0.118, 0.6: 0.197, 0.7: 0.293, 0.8: 0.396, 0.9: 0.498, 1.0: 0.591}
+LOSS = {0.1: 0.0005, 0.2: 0.006, 0.3: 0.0235, 0.4: 0.06, 0.5: 0.118, 0.6: 0.197, 0.7: 0.292, 0.8: 0.396, 0.9: 0.498, 1.0: 0.591}
 """Share of light from everywhere that a white metal swallows, by roughness."""
 
 _ROUGH, _TILT = 32, 64  # nodes of the table of albedos

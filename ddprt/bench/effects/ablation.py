@@ -69,6 +69,7 @@ class Row:
       noise: relative RMSE that the noise of both makes by itself.
       energy_share: of all light as planned, what it lacks; below 0 where it has more.
       largest_change: anywhere under any lighting, as a share of that lighting's largest direct irradiance; noise included.
+        None where no lamp lights anything.
       bound: what the plan says that this can be at most; None: unbounded.
       seconds: of the bake, median; without what takes the same whatever is simulated.
       rays: of the bake.
@@ -189,7 +190,8 @@ def _row(
     indices = planned.split("test")
     weight = planned.area[:, None] / planned.area.sum()
     place = counterparts(planned, other)
-    energy, squares, changed, change, noise, largest = np.zeros(6)
+    energy, squares, changed, change, noise = np.zeros(5)
+    largest: list[float] = []
     for index in indices:
         light, noisy = _light(planned, index), planned.maps("noise", [index])[0]
         there, unsure = (_there(values, place) for values in (_light(other, index), other.maps("noise", [index])[0]))
@@ -199,7 +201,8 @@ def _row(
         change += (weight * (light - there).astype(np.float64) ** 2).sum()
         noise += (weight * (noisy.astype(np.float64) ** 2 + unsure.astype(np.float64) ** 2)).sum()
         brightest = planned.maps("direct", [index]).max()
-        largest = max(largest, np.abs(light - there).max() / brightest) if brightest > 0 else largest
+        if brightest > 0:
+            largest.append(float(np.abs(light - there).max() / brightest))
     lit = squares > 0 and energy > 0
     return Row(
         variant.name,
@@ -208,7 +211,7 @@ def _row(
         float(np.sqrt(change / squares)) if lit else None,
         float(np.sqrt(noise / squares)) if lit else None,
         float(changed / energy) if lit else None,
-        float(largest) if lit else None,
+        max(largest, default=None) if lit else None,
         effect.bound if effect else 0.0,
         seconds,
         rays,

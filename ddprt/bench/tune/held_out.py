@@ -8,7 +8,7 @@ there are none of these, a lighting worse than all is reckoned with.
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, MutableMapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,20 +16,20 @@ import numpy as np
 
 from ddprt import seeds
 from ddprt.axes import Float64
+from ddprt.bench.measure.settings import digest_of
 from ddprt.bench.measure.trial import Workshop, measured_here
 from ddprt.bench.measure.trial import environment as here
 from ddprt.bench.measure.yardstick import Yardstick, make_yardstick
-from ddprt.bench.tune.suspects import Suspects, balanced, draw_candidates
-from ddprt.dataset.store import Dataset
+from ddprt.bench.tune.fitted import Fitted
+from ddprt.bench.tune.suspects import Suspects, balanced, draw_candidates, measured
 from ddprt.errors import UserError
-from ddprt.files import make_folder, write_text
+from ddprt.files import make_folder, read_tensors, write_tensors, write_text
 from ddprt.lights import Lighting, lighting_json, parse_lighting
 from ddprt.report.metrics import Tally
 from ddprt.runtime.model import Model
 
-Fitted = Callable[[], tuple[Model, Dataset]]
-"""Gives a model, and the dataset that it was fitted to."""
 _LISTED = "lightings.json"
+_VALUES = "values.safetensors"
 _TOLD = "took.json"  # seconds of a bake, beside its dataset
 _WORSE = 2.0  # times the largest squared error, of one more lighting that is reckoned with; measured in docs/tuning.md
 _SHARE = 0.1  # noise of more held-out maps over the limit of the error: adds 0.5 % to an error that is at the limit
@@ -57,9 +57,19 @@ class HeldOut:
         """Lightings, all in all."""
         return sum(len(yardstick.held_out) for yardstick in (self.workshop.yardstick, *self._more))
 
-    def tally(self, model: Model) -> Tally:
-        """Errors of a model under all of them, each lighting weighed so that means are those over the configuration's."""
-        found = Tally.joined([yardstick.tally(model) for yardstick in (self.workshop.yardstick, *self._more)])
+    def tally(self, model: Model, told: MutableMapping[Yardstick, Tally] | None = None) -> Tally:
+        """Errors of a model under all of them, each lighting weighed so that means are those over the configuration's.
+
+        Args:
+          model: that is scored.
+          told: what was told of this very model before, by yardstick; what is not there yet comes to it.
+        """
+        known: MutableMapping[Yardstick, Tally] = {} if told is None else told
+        yardsticks = self.workshop.yardstick, *self._more
+        for yardstick in yardsticks:
+            if yardstick not in known:
+                known[yardstick] = yardstick.tally(model)
+        found = Tally.joined([known[yardstick] for yardstick in yardsticks])
         if self._suspects is None:
             return found
         even = self.workshop.yardstick.measured(self._suspects.model)[: len(self.workshop.yardstick.held_out)]
@@ -77,25 +87,34 @@ class HeldOut:
         # Third moments add up, and that of a mean of many candidates is small.
         return whole, skew * (spread / whole) ** 3 if whole else 0.0
 
-    def more(self, fitted: Fitted, limit: float, allowance: float, times: int = 2) -> bool:
+    def more(
+        self,
+        fitted: Callable[[], Fitted],
+        limit: float,
+        allowance: float,
+        times: int = 2,
+        expected: Callable[[int, float], float] | None = None,
+    ) -> bool:
         """Draws some more, where that is possible and costs no more than is allowed.
 
         Args:
-          fitted: gives a model and what it was fitted to, whose errors the lightings are drawn for the first time; later ones
-            are drawn for the same, so that what each counts for stays.
+          fitted: gives a model, whose errors the lightings are drawn for the first time; later ones are drawn for the same, so
+            that what each counts for stays.
           limit: the error that is to be told from what is beyond it; held-out maps are baked as finely as that takes.
-          allowance: seconds that more lightings may take, all in all. Those drawn first are never too dear, since what they
-            take is not known yet; after that a lighting is expected to take as long as one did the last time.
+          allowance: seconds that more lightings may take, all in all.
           times: how many times as many there are then.
+          expected: seconds that a bake of so many lightings, as noisy as that, is expected to take the first time; None allows
+            these whatever they take. After that a lighting is expected to take as long as one did the last time.
         Returns:
           Whether there are more; never where they come from a file, which has no others.
         """
         config, count = self.workshop.config, (times - 1) * self.count
-        if config.lightings.file or (self._more and self.seconds + count * self._each > allowance):
+        noise = max(config.bench.noise, float(f"{min(1.0, _SHARE * limit):.1g}"))
+        taking = count * self._each if self._more else expected(count, noise) if expected else 0.0
+        if config.lightings.file or (taking and self.seconds + taking > allowance):
             return False
         scene, progress = self.workshop.scene, self.workshop.progress
-        suspects = self._suspects or Suspects.of(*fitted(), self._candidates())
-        noise = max(config.bench.noise, float(f"{min(1.0, _SHARE * limit):.1g}"))
+        suspects = self._suspects or self._measured(fitted())
         lightings, density = suspects.draw(count, seeds.number(config.seed, "more held-out lightings", len(self._more)))
         folder = self.workshop.folder / f"truth-{self.workshop.truth}-{suspects.digest}-{len(self._more)}-{count}-{noise:g}"
         make_folder(folder)
@@ -115,6 +134,24 @@ class HeldOut:
         self._more.append(found)
         self.seconds, self._each = self.seconds + took, took / count
         return True
+
+    def _measured(self, fitted: Fitted) -> Suspects:
+        """Candidates and how likely each is to be drawn, as measured before or now; what that took is counted in.
+
+        What points measure does not depend on what was learned, so models with the same points share it, and so do searches.
+        """
+        lightings, model = self._candidates(), fitted.model
+        key = digest_of([model.samples.digest, model.samples.spacing, model.points, model.quantity])
+        folder = self.workshop.folder / f"truth-{self.workshop.truth}-candidates-{key}"
+        path, begun = folder / _VALUES, time.perf_counter()
+        if path.is_file():
+            values = read_tensors(path)["values"]
+        else:
+            values = measured(model, lightings)
+            make_folder(folder)
+            write_tensors(path, {"values": values})
+        self.seconds += _took(folder, time.perf_counter() - begun)
+        return Suspects.of(model, fitted.data, lightings, values)
 
     def _candidates(self) -> list[Lighting]:
         """Lightings to draw from, as they were drawn before or now; what that took is counted in."""

@@ -13,15 +13,16 @@ from ddprt.bench.measure.settings import Setting, changed
 from ddprt.bench.measure.timing import timed
 from ddprt.bench.measure.trial import Workshop, about, environment, why
 from ddprt.bench.tune.curves import first_bases, time_of_frame, with_measured, without_last
+from ddprt.bench.tune.fitted import Fitted
 from ddprt.bench.tune.held_out import HeldOut, error_of
 from ddprt.bench.tune.knobs import FACTORS, around, value_of
 from ddprt.bench.tune.outcome import UNITS, Doubt, Outcome
 from ddprt.bench.tune.planner import HOPELESS, KNOBS, QUANTITIES, SURE, Place, Plan, Planner, Trial, seconds
 from ddprt.config import Config
 from ddprt.dataset.forecast import forecast
-from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.files import alone_in, append_line, make_folder, write_text
+from ddprt.report.metrics import Tally
 from ddprt.runtime.model import Model
 from ddprt.runtime.precision import shipped_bytes, stored
 from ddprt.runtime.train import fit_config
@@ -44,6 +45,7 @@ class Search:
       factors: what each of `KNOBS` may be, over the base.
       measure: what is found at a place, for those who know it already; None bakes there.
       expected: seconds that the base's bake is forecast to take, for those who know; None forecasts where that matters.
+      fits: of other searches in the same workshop, by place and number of bases; what is fitted comes to them.
     Raises:
       UserError: no limit is set, or another method than svd-ridge is to be tuned.
     """
@@ -55,6 +57,7 @@ class Search:
         factors: Mapping[str, Sequence[float]] = FACTORS,
         measure: Callable[[Place], Trial] | None = None,
         expected: float | None = None,
+        fits: dict[tuple[Place, int], Fitted] | None = None,
     ) -> None:
         limits = {name: getattr(config.tune, f"max_{name}") for name in QUANTITIES}
         self.limits = {name: limit for name, limit in limits.items() if limit > 0}
@@ -72,6 +75,7 @@ class Search:
         values = [around(config, knob, base, factors[knob]) for knob, base in zip(KNOBS, self.base, strict=True)]
         self._known = measure or self.measure
         self._expected = expected
+        self._fits = {} if fits is None else fits
         self.bases = tuple(
             count for count in BASES if count > (config.fit.centre == "mean")
         )  # the mean alone is another method
@@ -167,12 +171,12 @@ class Search:
         left = self._allowed() - tried
         allowed = min(_LIGHTINGS * tried, left)
 
-        def fitted() -> tuple[Model, Dataset]:
-            setting = self.setting(plan)
-            data, _ = self.workshop.bake(setting)
-            return self._fit(setting, data)[0], data
+        def expected(count: int, noise: float) -> float:
+            return planner.cost((self.base[0], float(count), noise, self.base[3]))
 
-        if left <= 0 or not self.held_out.more(fitted, self.limits["relative_rmse"], allowed, times):
+        if left <= 0 or not self.held_out.more(
+            lambda: self.fitted(plan), self.limits["relative_rmse"], allowed, times, expected
+        ):
             return False
         for trial in planner.trials:
             planner.replace(self.scored_again(trial))
@@ -229,15 +233,13 @@ class Search:
         Raises:
           UserError: whatever hinders a bake or a fit.
         """
-        setting = self.setting(Plan(place, max(BASES), "float"))
-        data, baked = self.workshop.bake(setting)
-        model, fitted = self._fit(setting, data)
-        most = model.relighter.report.bases
+        plan = Plan(place, max(BASES), "float")
+        setting, found = self.setting(plan), self.fitted(plan)
+        most = found.model.relighter.report.bases
         sizes = [count for count in _SCORED if count in self.bases and count < most] + [most]
-        shorter = [first_bases(model, count) for count in sizes]
-        errors, spread, skew = self._curve(model, sizes)
-        values = data.values(data.split("train")[:1], model.points, model.quantity)[0]
-        frames = [time_of_frame(one, values) for one in shorter]
+        shorter = [first_bases(found.model, count) for count in sizes]
+        errors, spread, skew = self._curve(found, sizes)
+        frames = [time_of_frame(one, found.values) for one in shorter]
         trial = Trial(
             place,
             tuple(sizes),
@@ -247,52 +249,57 @@ class Search:
             tuple(frame for frame, _ in frames),
             tuple(off for _, off in frames),
             {name: tuple(shipped_bytes(one, name) / 1e6 for one in shorter) for name in _PRECISIONS},
-            baked["seconds"],
-            fitted,
+            found.bake["seconds"],
+            found.seconds,
         )
-        record = {**about(setting), "trial": asdict(trial), "bake": baked, "environment": environment()}
+        record = {**about(setting), "trial": asdict(trial), "bake": found.bake, "environment": environment()}
         append_line(self.workshop.folder / "trials.jsonl", json.dumps(record, allow_nan=False))
         return trial
 
-    def _curve(self, model: Model, sizes: Sequence[int]) -> tuple[tuple[float, ...], float, float]:
+    def _curve(self, found: Fitted, sizes: Sequence[int]) -> tuple[tuple[float, ...], float, float]:
         """Errors at so many bases, and how sure that of the most is."""
-        most = model.relighter.report.bases
-        tallies = [self.held_out.tally(stored(without_last(model, most - count), "half")) for count in sizes]
+        most = found.model.relighter.report.bases
+        tallies = [self._tally(found, without_last(found.model, most - count), count, "half") for count in sizes]
         return tuple(map(error_of, tallies)), *self.held_out.spread(tallies[-1])
+
+    def _tally(self, found: Fitted, model: Model, bases: int, precision: str) -> Tally:
+        """Errors of a model as it ships, which is one that was fitted, or its first bases."""
+        return self.held_out.tally(stored(model, precision), found.tallies.setdefault((bases, precision), {}))
 
     def scored_again(self, trial: Trial) -> Trial:
         """The same with its errors on all held-out lightings there are now."""
-        setting = self.setting(Plan(trial.place, max(BASES), "float"))
-        data, _ = self.workshop.bake(setting)
-        errors, spread, skew = self._curve(self._fit(setting, data)[0], trial.bases)
+        errors, spread, skew = self._curve(self.fitted(Plan(trial.place, max(BASES), "float")), trial.bases)
         return replace(trial, errors=errors, error_spread=spread, error_skew=skew)
 
     def _verify(self, plan: Plan) -> dict[str, float]:
         """The plan itself, fitted and scored; the trial of its place takes over what differs from its curves."""
-        setting = self.setting(plan)
-        data, baked = self.workshop.bake(setting)
-        model, fitted = self._fit(setting, data)
-        model = stored(model, plan.precision)
-        values = data.values(data.split("train")[:1], model.points, model.quantity)[0]
-        tally = self.held_out.tally(model)
+        found = self.fitted(plan)
+        model = stored(found.model, plan.precision)
+        tally = self._tally(found, found.model, model.relighter.report.bases, plan.precision)
         known = next(trial for trial in reversed(self.planner.trials) if trial.place == plan.place)
         curves = zip(known.bases, known.frame_us, known.frame_spread, strict=True)
         before = [(taken, spread) for bases, taken, spread in curves if bases == plan.bases]
-        frame, off = time_of_frame(model, values, limit=self.limits.get("frame_us"), before=before)
+        frame, off = time_of_frame(model, found.values, limit=self.limits.get("frame_us"), before=before)
         reached = {
             "relative_rmse": error_of(tally),
             "frame_us": frame,
             "megabytes": shipped_bytes(model, plan.precision) / 1e6,
-            "bake_seconds": float(baked["seconds"]),
-            "fit_seconds": fitted,
+            "bake_seconds": float(found.bake["seconds"]),
+            "fit_seconds": found.seconds,
         }
         self.planner.trials.remove(known)
         self.planner.add(with_measured(known, plan, reached, *self.held_out.spread(tally), off))
         return reached
 
-    def _fit(self, setting: Setting, data: Dataset) -> tuple[Model, float]:
-        model, timing = timed(lambda: fit_config(data, setting.config, "svd-ridge"), 1)
-        return model, timing.median
+    def fitted(self, plan: Plan) -> Fitted:
+        """A plan baked and fitted, now or before; in which precision it is stored does not matter."""
+        key = plan.place, plan.bases
+        if key not in self._fits:
+            setting = self.setting(plan)
+            data, baked = self.workshop.bake(setting)
+            model, timing = timed(lambda: fit_config(data, setting.config, "svd-ridge"), 1)
+            self._fits[key] = Fitted(model, data, baked, timing.median)
+        return self._fits[key]
 
     def setting(self, plan: Plan) -> Setting:
         """A plan as a configuration."""
