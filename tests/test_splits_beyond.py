@@ -18,6 +18,7 @@ from ddprt.lights import PointLight
 from ddprt.methods import METHODS
 from ddprt.methods.floors import MeanMap
 from ddprt.progress import Progress
+from ddprt.report.metrics import Truth
 
 QUIET = Progress(quiet=True)
 
@@ -81,6 +82,10 @@ def test_more_lights_are_asked_about_and_noted_once(tmp_path: Path, monkeypatch:
     assert {len(truth[1].lightings[index]) for index in truth[1].split("test")} == {4}
     assert len(records) == 2 * 2 * 2
     assert all(len(record["error"]) == 4 for record in records)
+    for record in records:
+        judged = truth[record["side"] == "4 lights"]
+        squares = Truth(judged.maps("indirect", judged.split("test")), judged.area).squares
+        np.testing.assert_array_equal(record["squares"], squares)
     found = told(records, ["crowd"])[0]
     assert [name for name, _ in found["rows"]] == [BASELINE, "gain"]
     assert found["sides"] == ["1 light, as trained", "4 lights"]
