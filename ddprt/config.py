@@ -22,6 +22,7 @@ from ddprt.sections import (
     EffectsConfig,
     ExportConfig,
     FitConfig,
+    LeaguesConfig,
     LightingsConfig,
     MethodsConfig,
     PointsConfig,
@@ -53,6 +54,7 @@ class Config(Section):
     sweep: dict[str, tuple[Any, ...]] = Field(
         {}, description="values that `ddprt bench` tries of a setting, e.g. {fit.bases = [4, 16, 64]}; empty: a plan of its own"
     )
+    leagues: LeaguesConfig = LeaguesConfig()
     budget: BudgetConfig = BudgetConfig()
     tune: TuneConfig = TuneConfig()
 
@@ -63,7 +65,7 @@ class Config(Section):
         if not isinstance(table, dict):
             return table
         knobs = dict(_flat(table))
-        asks = ("bench", "sweep", "budget", "tune", "report")
+        asks = ("bench", "sweep", "leagues", "budget", "tune", "report")
         known = [key for key in keys() if key.split(".")[0] not in asks]
         for key, values in knobs.items():
             if key not in known:

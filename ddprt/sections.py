@@ -262,6 +262,17 @@ class BenchConfig(Section):
     keep: bool = Field(False, description="keep the datasets of the sweep when they have been measured")
 
 
+class LeaguesConfig(Section):
+    """How `ddprt bench --leagues` compares methods: under budgets of bytes, operations and seconds, on the same data."""
+
+    methods: tuple[str, ...] = Field((), description="rivals of svd-ridge; empty: all but floors")
+    seeds: int = Field(3, ge=1, le=100, description="deals of the training lightings, each with a search and a key of its own")
+    trials: int = Field(8, ge=1, le=1000, description="settings that every method tries for each seed, its defaults the first")
+    bytes: int = Field(0, ge=0, description="that may ship; 0: as many as svd-ridge's as configured")
+    flops: int = Field(0, ge=0, description="operations that a frame may take; 0: likewise")
+    seconds: float = Field(0.0, ge=0.0, description="that a fit may take without compiling; 0: 1.5 times svd-ridge's")
+
+
 class BudgetConfig(Section):
     """What `ddprt eval --budget` takes apart, and how closely it looks."""
 

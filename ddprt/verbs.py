@@ -107,6 +107,7 @@ def evaluate(call: Call) -> None:
 def bench(call: Call) -> None:
     """try settings about a configuration: error against seconds, bytes and memory"""
     asked = [f"--{flag}" for flag in ("peers", "effects", "methods") if call.asks(flag)]
+    asked += ["--leagues or --splits"] * (call.asks("leagues") or call.asks("splits"))
     if len(asked) > 1:
         raise UserError(f"ddprt bench: got {' and '.join(asked)}, expected one of them; run it once for each")
     if call.asks("methods"):
@@ -118,6 +119,8 @@ def bench(call: Call) -> None:
         return None
     if call.asks("peers"):
         return peers(call)
+    if call.asks("leagues") or call.asks("splits"):
+        return leagues(call)
     if call.asks("quick"):
         raise UserError("--quick: got no --peers, which it belongs to; a sweep is shortened by --sweep.SECTION.KEY")
     if call.asks("effects"):
@@ -129,6 +132,25 @@ def bench(call: Call) -> None:
     results, page, *others = call.run().sweep()
     print(f"results:  {results}\npage:     {page}\nfigures:  {others[-1].parent}")
     return None
+
+
+def leagues(call: Call) -> None:
+    """Methods under the same budgets, and on lightings unlike those of training."""
+    from ddprt.bench.leagues.generalisation import Generalisation, markdown, told
+    from ddprt.bench.leagues.leagues import leagues
+    from ddprt.bench.leagues.splits import split_names
+    from ddprt.files import write_text
+
+    names = split_names(call.options["splits"]) if call.asks("splits") else []
+    job = call.run()
+    data, folder, found = job.bake(), job.folder / "bench", []
+    if names:
+        found = told(Generalisation(job.config, data, job.scene, folder, job.progress).run(names), names)
+        write_text(folder / "splits.md", markdown(found, job.config.scene.name))
+        print(f"splits:   {folder / 'splits.md'}")
+    if call.asks("leagues"):
+        results, table, page = leagues(job.config, data, job.scene, folder, job.progress, splits=found)[1]
+        print(f"results:  {results}\ntable:    {table}\npage:     {page}")
 
 
 def peers(call: Call) -> None:
@@ -285,10 +307,11 @@ VERBS = {
     ),
     "bench": Verb(
         bench,
-        options=_OUT,
+        options=_OUT | {"splits": "NAMES  train on one thing, ask about another: kind,outside,... or all (docs/leagues.md)"},
         flags={
             "peers": "compare fit, transfer and relighting with other libraries; FILE may be left out",
             "methods": "list all methods, those of other packages too, with their settings; no FILE",
+            "leagues": "methods under equal budgets of bytes, operations and seconds, tuned alike (section [leagues])",
             "effects": "what each effect that is called for changes in light, seconds and rays",
             "quick": "less of it",
         },

@@ -37,6 +37,7 @@ BENCH = {
     "tune": ["measure"],
     "peers": ["measure"],
     "effects": ["measure"],
+    "leagues": ["measure"],
 }
 """The parts of that room, and which other parts each may import."""
 FILES = sorted(PACKAGE.rglob("*.py"))

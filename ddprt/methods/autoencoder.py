@@ -6,6 +6,7 @@ analysis: learning from examples without local minima", 1989). Adam hardly gets 
 told apart differs by 1e-4 of the light; L-BFGS takes some 150.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -26,6 +27,11 @@ class Autoencoder(Learned):
 
     relighter: ClassVar[type] = LinearTransfer
     why: ClassVar[str] = "learned: does gradient descent from a random start find the SVD's subspace?"
+    search: ClassVar[Mapping[str, tuple[Any, ...]]] = {
+        "bases": (6, 8, 12, 14, 16, 24, 32),
+        "ridge": ("auto", 1e-5, 1e-3),
+        "steps": (100, 300),
+    }
     bases: int = Field(16, ge=1)
     ridge: Literal["auto"] | float = "auto"
     steps: int = Field(300, ge=1)

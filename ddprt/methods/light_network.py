@@ -14,7 +14,7 @@ Areas are told by their centre, their mean direction and their reach; a sky is t
 up to `SKY` make, so a method that was trained under suns answers for it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
@@ -262,6 +262,12 @@ class LightNetworks(Learned):
 
     relighter: ClassVar[type] = LightNetwork
     why: ClassVar[str] = "learned: sees where the lamps are and nothing else, so what do measurements add?"
+    search: ClassVar[Mapping[str, tuple[Any, ...]]] = {
+        "bases": (6, 8, 12, 14, 16, 24, 32),
+        "features": (64, 128, 256, 512),
+        "steps": (100, 300),
+        "weight_decay": (0.0, 1e-4),
+    }
     space: Literal["linear"] = "linear"
     bases: int = Field(16, ge=1)
     ridge: Literal["auto"] | Annotated[float, Field(ge=0)] = "auto"

@@ -9,7 +9,7 @@ for equal shapes, no NaN for a dark lighting, twice the light is twice the resul
 the mean lightmap or `FitReport.status` says so. What statuses there are, and what each asks for: `STATUSES`.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
@@ -161,12 +161,15 @@ class Method(BaseModel):
     """Base of the methods' settings records; those that can learn from `Maps` say that they `streams`.
 
     A Relighter of a method that streams is none that `AsksForLights`. A method with a field `space` fits in that space alone.
+    `search` says what `ddprt bench --leagues` may try: settings of the method (or "fit.KEY" of [fit]) and their choices; those
+    of `bases` are meant for 16 and grow with the configuration's. A method without one runs with its defaults alone.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     streams: ClassVar[bool] = False
     relighter: ClassVar[type]
     why: ClassVar[str]
+    search: ClassVar[Mapping[str, tuple[Any, ...]]] = {}
 
     def fit(self, train: Examples, validation: Examples, *, key: Array) -> Relighter:
         """Learns from `train`; `validation` may stop it early; `key` is its only randomness."""

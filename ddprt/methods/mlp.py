@@ -3,8 +3,9 @@
 Same basis, same split and same metrics as the baseline, so the comparison exists from the first day.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -53,6 +54,14 @@ class Mlp(Learned):
 
     relighter: ClassVar[type] = Perceptron
     why: ClassVar[str] = "learned: does a nonlinear map beat the ridge on the same basis?"
+    search: ClassVar[Mapping[str, tuple[Any, ...]]] = {
+        "bases": (6, 8, 12, 14, 16, 24, 32),
+        "width": (16, 32, 64, 128),
+        "depth": (1, 2, 3),
+        "learning_rate": (1e-3, 2e-3, 5e-3),
+        "weight_decay": (1e-4, 1e-2, 0.1),
+        "steps": (500, 2000),
+    }
     streams: ClassVar[bool] = True
     bases: int = Field(16, ge=1)
     width: int = Field(128, ge=1, le=4096)

@@ -13,9 +13,10 @@ Reference: Thies, Zollhoefer and Niessner, "Deferred neural rendering: image syn
 textures", SIGGRAPH 2023 (decoders small enough for a fragment shader).
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Annotated, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -126,6 +127,13 @@ class NeuralMap(Learned):
 
     relighter: ClassVar[type] = NeuralLightmap
     why: ClassVar[str] = "learned: do a texel's numbers make further maps through a network that a fragment shader can run?"
+    search: ClassVar[Mapping[str, tuple[Any, ...]]] = {
+        "bases": (6, 8, 12, 14, 16, 24, 32),
+        "width": (8, 16, 32, 64),
+        "light": ("last", "last", "everywhere"),
+        "learning_rate": (2e-3, 5e-3, 1e-2),
+        "steps": (500, 2000),
+    }
     bases: int = Field(16, ge=1, description="features of a texel, each the baseline's basis texture to begin with")
     coefficients: int = Field(
         0, ge=0, description="numbers that tell of the light; 0: twice the bases, as many as them where it enters everywhere"

@@ -15,6 +15,7 @@ Boutsidis and Gallopoulos, "SVD based initialization", Pattern Recognition 2008 
 semi-nonnegative matrix factorizations", PAMI 2010.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
@@ -35,6 +36,12 @@ class Nonnegative(Method):
 
     relighter: ClassVar[type] = LinearTransfer
     why: ClassVar[str] = "learned: what does a basis cost whose textures are light, fit for unsigned bytes without a bias?"
+    search: ClassVar[Mapping[str, tuple[Any, ...]]] = {
+        "bases": (6, 8, 12, 14, 16, 24, 32),
+        "coefficients": ("free", "positive"),
+        "start": ("svd", "random"),
+        "sweeps": (50, 200, 1000),
+    }
     bases: int = Field(16, ge=1)
     ridge: Literal["auto"] | Annotated[float, Field(ge=0)] | tuple[Annotated[float, Field(ge=0)], ...] = "auto"
     coefficients: Literal["positive", "free"] = Field("free", description="signs that coefficients may have in training")

@@ -17,8 +17,9 @@ The network learns, with points dropped at random, what transfers miss that have
 it is taken is decided on validation lightings, once for all points and once for fewer; it is none where it makes them worse.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -192,6 +193,14 @@ class PointSet(Learned):
 
     relighter: ClassVar[type] = SetEncoder
     why: ClassVar[str] = "learned: any number of points in any order; what does losing some of them cost?"
+    search: ClassVar[Mapping[str, tuple[Any, ...]]] = {
+        "bases": (6, 8, 12, 14, 16, 24, 32),
+        "latent": (24, 48, 64),
+        "width": (16, 32, 64),
+        "depth": (1, 2),
+        "learning_rate": (1e-4, 3e-4, 1e-3),
+        "keep": (0.25, 0.5),
+    }
     bases: int = Field(16, ge=1)
     ridge: Literal["auto"] | Annotated[float, Field(ge=0)] = "auto"
     latent: int = Field(64, ge=1, description="numbers that stand for all measurements")

@@ -5,6 +5,7 @@ question, since those of the transfer itself are too small; how much of its corr
 lightings, and it is none where that makes them worse. Reference: Wolpert, "Stacked generalization", Neural Networks 1992.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -62,6 +63,14 @@ class Residual(Learned):
 
     relighter: ClassVar[type] = Corrected
     why: ClassVar[str] = "learned: is there anything non-linear left that the ridge misses?"
+    search: ClassVar[Mapping[str, tuple[Any, ...]]] = {
+        "bases": (6, 8, 12, 14, 16, 24, 32),
+        "width": (16, 32, 64),
+        "depth": (1, 2),
+        "learning_rate": (1e-3, 2e-3, 5e-3),
+        "weight_decay": (1e-3, 1e-2, 0.1),
+        "steps": (500, 2000),
+    }
     streams: ClassVar[bool] = True
     bases: int = Field(16, ge=1)
     ridge: Literal["auto"] | Annotated[float, Field(ge=0)] = "auto"

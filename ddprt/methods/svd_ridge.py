@@ -7,8 +7,9 @@ K = R R^T that is the plain ridge on M' = M K^-1 R for measurements X R, so that
 out hold as they stand; M = M' R^T has the size of the plain one.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -101,6 +102,14 @@ class SvdRidge(Method):
 
     relighter: ClassVar[type] = LinearTransfer
     why: ClassVar[str] = "the paper's baseline: closed form, linear, the reference point"
+    search: ClassVar[Mapping[str, tuple[Any, ...]]] = {
+        "bases": (6, 8, 12, 14, 16, 24, 32),
+        "ridge": ("auto", 1e-5, 1e-3),
+        "smooth": (0.0, 1.0, 3.0),
+        "centre": ("none", "mean"),
+        "fit.space": ("linear", "linear", "gamma"),
+        "fit.channels": ("mono", "mono", "multi"),
+    }
     streams: ClassVar[bool] = True
     bases: int = Field(16, ge=1)
     centre: Literal["none", "mean"] = "none"

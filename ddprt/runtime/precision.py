@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -33,9 +34,9 @@ PRECISIONS: Catalogue[tuple[int, Rounding]] = Catalogue(
 def stored(model: Model, precision: str) -> Model:
     """The model as it comes back from its stored form.
 
-    Of svd-ridge the basis and the mean are stored so, each map scaled to a largest magnitude of 1 (the mean in halves as it is,
-    as `ddprt.export.textures` writes it), while matrices and scales stay float32. Of other methods every array is, each row of
-    its first axis scaled likewise.
+    Of every method the maps are stored so, that is, arrays one of whose axes has the texels of the atlas, or their colours side
+    by side; each map is scaled to a largest magnitude of 1 (svd-ridge's mean in halves as it is, as `ddprt.export.textures`
+    writes it). Matrices, weights and scales stay float32: they are small, and a shader holds them in no texture.
 
     Args:
       model: as it was fitted.
@@ -52,7 +53,8 @@ def stored(model: Model, precision: str) -> Model:
         kept = _half(mean) if precision == "half" else _by_rows(mean[None], rounding)[0]
         basis = _by_rows(np.asarray(relighter.basis, np.float32), rounding)
         return replace(model, relighter=replace(relighter, basis=jnp.asarray(basis), mean=jnp.asarray(kept)))
-    rounded = jax.tree.map(lambda leaf: jnp.asarray(_leaf(np.asarray(leaf), rounding)), relighter)
+    texels = len(model.area)
+    rounded = jax.tree.map(lambda leaf: jnp.asarray(_leaf(np.asarray(leaf), texels, rounding)), relighter)
     return replace(model, relighter=replace(rounded, report=relighter.report))
 
 
@@ -72,16 +74,24 @@ def shipped_bytes(model: Model, precision: str) -> int:
         maps = relighter.basis.size + (relighter.mean.size if has_mean else 0)
         rest = relighter.matrix.size + relighter.offset.size + relighter.intercept.size
         return int(size * maps + 4 * (rest + len(relighter.basis)))
-    leaves = [leaf for leaf in jax.tree.leaves(relighter) if jnp.issubdtype(leaf.dtype, jnp.floating)]
-    scales = 0 if precision == "float" else sum(len(leaf) if leaf.ndim > 1 else 1 for leaf in leaves)
-    return int(relighter.nbytes - sum((leaf.dtype.itemsize - size) * leaf.size for leaf in leaves) + 4 * scales)
+    leaves = [(leaf, axis) for leaf in jax.tree.leaves(relighter) if (axis := _along(leaf, len(model.area))) is not None]
+    scales = 0 if precision == "float" else sum(leaf.size // leaf.shape[axis] for leaf, axis in leaves)
+    return int(relighter.nbytes - sum((leaf.dtype.itemsize - size) * leaf.size for leaf, _ in leaves) + 4 * scales)
 
 
-def _leaf(leaf: np.ndarray, rounding: Rounding) -> np.ndarray:
-    if not np.issubdtype(leaf.dtype, np.floating) or leaf.size == 0:
+def _along(leaf: Any, texels: int) -> int | None:
+    """The axis that runs over texels, or over their colours; None for what is no map."""
+    if not jnp.issubdtype(leaf.dtype, jnp.floating) or leaf.size == 0:
+        return None
+    return next((axis for axis in reversed(range(leaf.ndim)) if leaf.shape[axis] in (texels, 3 * texels)), None)
+
+
+def _leaf(leaf: np.ndarray, texels: int, rounding: Rounding) -> np.ndarray:
+    axis = _along(leaf, texels)
+    if axis is None:
         return leaf
-    rows = leaf.reshape(len(leaf) if leaf.ndim > 1 else 1, -1)
-    return _by_rows(rows, rounding).reshape(leaf.shape)
+    last = np.moveaxis(leaf, axis, -1)
+    return np.moveaxis(_by_rows(last.reshape(-1, last.shape[-1]), rounding).reshape(last.shape), -1, axis)
 
 
 def _by_rows(rows: Float[np.ndarray, "rows entries"], rounding: Rounding) -> Float[np.ndarray, "rows entries"]:

@@ -12,7 +12,7 @@ from ddprt.config import Config, checked
 from ddprt.errors import UserError
 from ddprt.methods import METHODS
 
-ASKED = ("bench", "sweep", "budget", "tune", "report")
+ASKED = ("bench", "sweep", "leagues", "budget", "tune", "report")
 """Sections that say what is measured, not what is made."""
 BAKED = ("scene", "atlas", "lightings", "points", "transport", "effects")
 """Sections that a dataset depends on."""
