@@ -21,7 +21,7 @@ from ddprt.scene.atlas import build_atlas
 from ddprt.scene.checks import checked
 from ddprt.scene.exr import write_exr
 from ddprt.scene.library import build
-from ddprt.scene.material import Cutout, Emission, Gloss, Material
+from ddprt.scene.material import Cutout, Emission, Gloss, Material, Subsurface
 from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import faceted, icosphere, rectangle
 from ddprt.sections import TransportConfig
@@ -222,6 +222,27 @@ def emission(quick: bool) -> Figure:
     return compared(mean, share @ expected, error)
 
 
+def subsurface(quick: bool) -> Figure:
+    """A white ball whose boundary refracts nothing: what falls on it leaves it, elsewhere. Its error is that of eight bakes."""
+    milk = Material("milk", (1.0,) * 3, subsurface=Subsurface((1.0,) * 3, (0.2,) * 3))
+    points, triangles = icosphere(2)
+    ball, sun, shares = checked("ball", points, triangles, materials=(milk,)), parse_lighting(SUN), []
+    for seed in range(8):
+        walks = 16 if quick else 256
+        config = configured(
+            {
+                "seed": seed,
+                "atlas": {"resolution": 24},
+                "points": {"on": "hull", "count": 4, "supersample": 1},
+                "transport": {"samples": walks, "test_samples": walks, "threads": 2},
+            }
+        )
+        data = ddprt.bake(ball, {split: [sun] for split in ("train", "validation", "test")}, config=config)
+        falls, leaves = (data.area @ data.maps(kind, data.split("test"))[0].astype(float) for kind in ("direct", "indirect"))
+        shares.append(leaves.sum() / falls.sum())
+    return compared(np.mean(shares), 1.0, np.std(shares, ddof=1) / math.sqrt(len(shares)))
+
+
 def probes(quick: bool) -> Figure:
     """In a closed sphere of albedo a about a lamp: a / (1 - a) of its light from all sides, and no other harmonic."""
     albedo, rays = 0.5, 1 << 12 if quick else 1 << 16
@@ -291,6 +312,7 @@ FIGURES: dict[str, Callable[[bool], Figure]] = {
     "cut-outs": cutouts,
     "two-sided sheets": two_sided,
     "emission": emission,
+    "subsurface": subsurface,
     "hair": hair,
     "probes": probes,
 }
