@@ -19,6 +19,7 @@ from ddprt.errors import UserError
 from ddprt.export.textures import export_textures
 from ddprt.files import read_tensors, write_tensors
 from ddprt.lights import parse_lighting
+from ddprt.progress import Progress
 from ddprt.report import figures, page, shots
 from ddprt.report.evaluate import evaluate, spot_check
 from ddprt.report.scenery import Scenery
@@ -153,18 +154,40 @@ def test_light_that_comes_flat_enters_less() -> None:
     assert matched.entering(light, sun, np.random.default_rng(0)) is light
 
 
+def test_neighbours_share_walks_as_far_as_it_pays_and_no_further(passing: tuple[Operator, Inside]) -> None:
+    """Noise alone is shared over the widest footprints, detail without noise over none; the error told is the true one."""
+    _, inside = passing
+    rng, count = np.random.default_rng(0), len(inside.texels)
+    detail = rng.random((4, count, 3), np.float32)
+    light, facts = inside.shared(detail, detail)
+    np.testing.assert_array_equal(light, detail)
+    assert facts == {"shared_over": 0.0, "error_expected": 0.0}
+    height = 2 + inside.atlas.position[inside.texels, 1].astype(np.float32)[None, :, None]
+    smooth = np.broadcast_to(height, (4, count, 3))
+    halves = [smooth + 0.5 * rng.standard_normal((4, count, 3), np.float32) for _ in range(2)]
+    light, facts = inside.shared(*halves)
+    weight = inside.atlas.area[inside.texels] / inside.atlas.area[inside.texels].sum()
+    error = float(np.einsum("ltc,t->", (light - smooth) ** 2, weight) / 12) ** 0.5
+    plain = float(np.einsum("ltc,t->", ((halves[0] + halves[1]) / 2 - smooth) ** 2, weight) / 12) ** 0.5
+    assert facts["shared_over"] == 1.0
+    assert error < 0.6 * plain
+    # Some 300 texels of 12 values, about five of which are one after sharing: 1 / sqrt(2 * 700), 3 %; four of these.
+    assert facts["error_expected"] * float(np.einsum("tc,t->", smooth[0], weight) / 3) == pytest.approx(error, rel=0.12)
+
+
 # --- bakes ---------------------------------------------------------------------------------------------------------------
 
 
-def baked(scene: Scene, lights: list[Any], tmp_path: Any, **changes: Any) -> Dataset:
+def baked(scene: Scene, lights: list[Any], tmp_path: Any, progress: Progress | None = None, **changes: Any) -> Dataset:
     config = base(atlas__resolution=24, points__count=4, points__supersample=1, transport__threads=2, **changes)
-    return bake(scene, [parse_lighting(light) for light in lights], config=config, out=tmp_path)
+    return bake(scene, [parse_lighting(light) for light in lights], config=config, out=tmp_path, progress=progress)
 
 
 def test_a_lonely_body_glows_from_behind_by_as_much_light_as_enters(tmp_path: Any) -> None:
     """White and index-matched, convex: all light that falls on it leaves, and none is gathered; also where no lamp shines."""
     scene = ball()
-    data = baked(scene, [lamp(0, 3, 0)] * 3, tmp_path, transport__samples=64, transport__test_samples=64)
+    progress = Progress(quiet=True)
+    data = baked(scene, [lamp(0, 3, 0)] * 3, tmp_path, progress, transport__samples=64, transport__test_samples=64)
     direct, indirect = (data.maps(kind, [0])[0] for kind in ("direct", "indirect"))
     area = data.area
     # 64 walks from each of 300 texels: single walks differ by about 1, so 0.7 % of noise; four of these.
@@ -173,6 +196,9 @@ def test_a_lonely_body_glows_from_behind_by_as_much_light_as_enters(tmp_path: An
     assert not direct[dark].any()
     assert (indirect[dark].max(1) > 0).mean() > 0.95  # of 64 walks from the far pole all may stay there
     assert data.description["exitant"] == ["milk"]
+    stages = {stage["name"]: stage for stage in progress.stages}
+    assert stages["subsurface train"]["shared_over"] >= 0
+    assert "shared_over" not in stages["subsurface test"]
     noise = data.maps("noise", data.split("test"))
     assert noise.any()
     assert spot_check(scene, data, base(report__spot_check_texels=8)) == {}  # by the reference, which cannot see it
