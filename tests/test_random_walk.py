@@ -5,13 +5,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from scipy.integrate import quad
+from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
 from ddprt import warp
 from ddprt.scene.material import Subsurface
 from ddprt.scene.shapes import box, icosphere
-from ddprt.transport.diffusion import decay_rate, depths
-from ddprt.transport.random_walk import Body, Exits, invert_henyey, pdf_henyey, sample_henyey, weight_of_jump
+from ddprt.transport.diffusion import decay_rate, depths, weight_of_jump
+from ddprt.transport.meetings import invert_flight, invert_henyey, pdf_flight, pdf_henyey, sample_flight, sample_henyey
+from ddprt.transport.random_walk import Body, Exits, _free, drawn
 from ddprt.transport.refraction import entered, fresnel, mean_entering
 
 OFFSET = 1e-6
@@ -94,6 +96,22 @@ def test_angles_of_scattering_are_henyey_and_greensteins(g: float) -> None:
     u = np.linspace(0.02, 0.98, 25)
     # Single precision: a cosine's rounding of 1e-7 is one of u that is the density times as large, 95 at g = 0.9.
     np.testing.assert_allclose(invert_henyey(sample_henyey(u, g), g), u, atol=3e-5)
+
+
+@pytest.mark.parametrize("extinction", [0.25, 40.0])
+def test_flights_by_chi_square(extinction: float) -> None:
+    """Drawn with the walks' own numbers: 31 bins of a length of a tenth of the mean each, and the rest."""
+    state = np.random.default_rng(8).integers(0, 1 << 64, 20_000, np.uint64)
+    numbers = np.array([drawn(state, i) for i in range(len(state))])
+    lengths = sample_flight(numbers, extinction)
+    edges = np.append(np.arange(32) / 10 / extinction, np.inf)
+    expected = np.array([quad(lambda t: float(pdf_flight(np.array([t]), extinction)[0]), *ends)[0] for ends in pairwise(edges)])
+    assert expected.sum() == pytest.approx(1, abs=1e-6)
+    found = np.histogram(lengths, edges)[0]
+    assert found.sum() == len(lengths)
+    assert ((found - expected * len(lengths)) ** 2 / (expected * len(lengths))).sum() < chi2.ppf(1 - 1e-4, len(expected) - 1)
+    # Numbers are multiples of 2^-24, and single precision rounds 1 - u and the logarithm by as much.
+    np.testing.assert_allclose(invert_flight(lengths, extinction), numbers, atol=3e-7)
 
 
 def test_free_paths_fall_off_as_beer_and_lambert_say() -> None:
@@ -262,16 +280,44 @@ def test_decay_is_the_root_of_its_equation() -> None:
     assert decay_rate(0.9999) == pytest.approx((3 * 1e-4) ** 0.5, rel=1e-3)  # diffusion's limit
 
 
-def test_depths_are_lower_bounds() -> None:
-    """In a cube, where distances are known; they are short by no more than what counts as the surface may be off, twice."""
+def test_depths_are_exact_near_the_surface_and_lower_bounds_elsewhere() -> None:
+    """In a cube, where distances are known; inside they are short by no more than what counts as the surface may be off."""
     corners = _cut(box(np.full(3, -1.0), np.full(3, 1.0)))
-    found, cell = depths(corners, np.full(3, -1.0), np.full(3, 1.0), 0.1)
-    place = (np.stack(np.meshgrid(*(np.arange(n) for n in found.shape), indexing="ij"), -1) + 0.5) * cell - 1
-    exact = (1 - np.abs(place)).min(-1)
-    inside = exact > 0
+    squared, cell = depths(corners, np.full(3, -1.0), np.full(3, 1.0), 0.1)
+    place = (np.stack(np.meshgrid(*(np.arange(n) for n in squared.shape), indexing="ij"), -1) + 0.5) * cell - 1
+    exact, found = (1 - np.abs(place)).min(-1), np.sqrt(squared)
+    inside, close = exact > 0, (exact > 0) & (exact < 4 * cell)
     assert (found <= np.abs(exact) + 1e-6)[inside].all()
+    np.testing.assert_allclose(found[close], exact[close], atol=1e-6)
     assert (exact - found)[inside].max() < 2 * cell * (3**0.5 / 2 + 0.5 / 3**0.5)
     assert found.max() > 0.7
+
+
+def test_what_lies_free_about_a_walk_is_never_too_much_and_hardly_too_little() -> None:
+    """In a body with dents, by all of its surface; in a slab, where what lies along it is lost: half a cell's square."""
+    hollow = ball(3)
+    hollow *= np.float32(1) - np.float32(0.6) * np.exp(-8 * (hollow[..., :1] - 0.8) ** 2)
+    rng = np.random.default_rng(2)
+    body = Body.of(Subsurface((1.0, 1.0, 1.0), (0.05, 0.05, 0.05)), hollow, OFFSET)
+    chosen = hollow[rng.integers(len(hollow), size=200)]
+    place = (rng.dirichlet((1, 1, 1), 200)[:, :, None] * chosen).sum(1) * rng.uniform(0.7, 1, (200, 1))
+    weights = np.stack([np.r_[a, 1 - sum(a)] for a in ((i / 12, j / 12) for i in range(13) for j in range(13 - i))])
+    dense = np.einsum("kc,tcd->tkd", weights, hollow).reshape(-1, 3)
+    exact = cKDTree(dense).query(place)[0]  # of points 0.012 apart: too far by less than 0.007 squared over twice the distance
+    found = np.array([free_at(body, one) for one in place])
+    assert (found <= exact + 1e-6).all()
+    flat = slab(1.0, 8.0)
+    body = Body.of(Subsurface((1.0, 1.0, 1.0), (0.05, 0.05, 0.05)), flat, OFFSET)
+    place = np.stack([rng.uniform(-1, 1, 200), -rng.uniform(0, 3 * body.cell, 200), rng.uniform(-1, 1, 200)], 1)
+    found = np.array([free_at(body, one) for one in place])
+    assert (found <= -place[:, 1] + 1e-6).all()
+    # Along each of two axes the spread is f (1 - f) of a cell squared, a quarter at most; and 1e-5 for rounding, which doubles.
+    assert (found**2 >= place[:, 1] ** 2 - (0.5 + 1e-4) * body.cell**2).all()
+    assert free_at(body, np.array([0, 1.0, 0])) == 0
+
+
+def free_at(body: Body, place: np.ndarray) -> float:
+    return float(_free(*place.astype(np.float32), body.depth, body.low, np.float32(body.cell)))
 
 
 # --- reciprocity ---------------------------------------------------------------------------------------------------------

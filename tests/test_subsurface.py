@@ -1,7 +1,11 @@
 """Subsurface scattering in scenes: who may hold a medium, R as an operator, whole bakes, and what is refused."""
 
 import json
+import re
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,10 +16,16 @@ import ddprt
 from ddprt.dataset.generate import bake
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
+from ddprt.export.textures import export_textures
+from ddprt.files import read_tensors, write_tensors
 from ddprt.lights import parse_lighting
-from ddprt.report.evaluate import spot_check
+from ddprt.progress import Progress
+from ddprt.report import figures, page, shots
+from ddprt.report.evaluate import evaluate, spot_check
+from ddprt.report.scenery import Scenery
 from ddprt.scene.atlas import build_atlas
 from ddprt.scene.checks import checked
+from ddprt.scene.exr import read_exr
 from ddprt.scene.library import build
 from ddprt.scene.material import Emission, Gloss, Material, Subsurface
 from ddprt.scene.mesh import Scene
@@ -144,18 +154,40 @@ def test_light_that_comes_flat_enters_less() -> None:
     assert matched.entering(light, sun, np.random.default_rng(0)) is light
 
 
+def test_neighbours_share_walks_as_far_as_it_pays_and_no_further(passing: tuple[Operator, Inside]) -> None:
+    """Noise alone is shared over the widest footprints, detail without noise over none; the error told is the true one."""
+    _, inside = passing
+    rng, count = np.random.default_rng(0), len(inside.texels)
+    detail = rng.random((4, count, 3), np.float32)
+    light, facts = inside.shared(detail, detail)
+    np.testing.assert_array_equal(light, detail)
+    assert facts == {"shared_over": 0.0, "error_expected": 0.0}
+    height = 2 + inside.atlas.position[inside.texels, 1].astype(np.float32)[None, :, None]
+    smooth = np.broadcast_to(height, (4, count, 3))
+    halves = [smooth + 0.5 * rng.standard_normal((4, count, 3), np.float32) for _ in range(2)]
+    light, facts = inside.shared(*halves)
+    weight = inside.atlas.area[inside.texels] / inside.atlas.area[inside.texels].sum()
+    error = float(np.einsum("ltc,t->", (light - smooth) ** 2, weight) / 12) ** 0.5
+    plain = float(np.einsum("ltc,t->", ((halves[0] + halves[1]) / 2 - smooth) ** 2, weight) / 12) ** 0.5
+    assert facts["shared_over"] == 1.0
+    assert error < 0.6 * plain
+    # Some 300 texels of 12 values, about five of which are one after sharing: 1 / sqrt(2 * 700), 3 %; four of these.
+    assert facts["error_expected"] * float(np.einsum("tc,t->", smooth[0], weight) / 3) == pytest.approx(error, rel=0.12)
+
+
 # --- bakes ---------------------------------------------------------------------------------------------------------------
 
 
-def baked(scene: Scene, lights: list[Any], tmp_path: Any, **changes: Any) -> Dataset:
+def baked(scene: Scene, lights: list[Any], tmp_path: Any, progress: Progress | None = None, **changes: Any) -> Dataset:
     config = base(atlas__resolution=24, points__count=4, points__supersample=1, transport__threads=2, **changes)
-    return bake(scene, [parse_lighting(light) for light in lights], config=config, out=tmp_path)
+    return bake(scene, [parse_lighting(light) for light in lights], config=config, out=tmp_path, progress=progress)
 
 
 def test_a_lonely_body_glows_from_behind_by_as_much_light_as_enters(tmp_path: Any) -> None:
     """White and index-matched, convex: all light that falls on it leaves, and none is gathered; also where no lamp shines."""
     scene = ball()
-    data = baked(scene, [lamp(0, 3, 0)] * 3, tmp_path, transport__samples=64, transport__test_samples=64)
+    progress = Progress(quiet=True)
+    data = baked(scene, [lamp(0, 3, 0)] * 3, tmp_path, progress, transport__samples=64, transport__test_samples=64)
     direct, indirect = (data.maps(kind, [0])[0] for kind in ("direct", "indirect"))
     area = data.area
     # 64 walks from each of 300 texels: single walks differ by about 1, so 0.7 % of noise; four of these.
@@ -164,13 +196,17 @@ def test_a_lonely_body_glows_from_behind_by_as_much_light_as_enters(tmp_path: An
     assert not direct[dark].any()
     assert (indirect[dark].max(1) > 0).mean() > 0.95  # of 64 walks from the far pole all may stay there
     assert data.description["exitant"] == ["milk"]
+    stages = {stage["name"]: stage for stage in progress.stages}
+    assert stages["subsurface train"]["shared_over"] >= 0
+    assert "shared_over" not in stages["subsurface test"]
     noise = data.maps("noise", data.split("test"))
     assert noise.any()
     assert spot_check(scene, data, base(report__spot_check_texels=8)) == {}  # by the reference, which cannot see it
 
 
-def test_equal_seeds_give_equal_bits_and_a_body_lights_the_ground(tmp_path: Any) -> None:
-    """A ball above a floor: the floor's lamp-side is as with an opaque ball, its shadow is lit through the ball."""
+@pytest.fixture(scope="module")
+def above(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scene, Dataset, Dataset]:
+    """A ball above a floor, baked twice."""
     milk = Material("milk", (1.0,) * 3, subsurface=Subsurface((1.0,) * 3, (0.3,) * 3))
     points, triangles = icosphere(2)
     floor = rectangle((-1.5, -1.5), (1.5, 1.5), -1.3, 1, facing=1)
@@ -179,11 +215,18 @@ def test_equal_seeds_give_equal_bits_and_a_body_lights_the_ground(tmp_path: Any)
         np.concatenate([points, floor]),
         np.concatenate([triangles, len(points) + np.array([[0, 1, 2], [0, 2, 3]])]),
         material=np.repeat([0, 1], [len(triangles), 2]),
-        materials=(milk, Material("black", (0.0,) * 3)),
+        materials=(milk, Material("dark", (0.25,) * 3)),
     )
     small = {"transport__samples": 16, "transport__test_samples": 32}
-    one, two = (baked(scene, [lamp(0, 4, 0)] * 3, tmp_path / name, **small) for name in ("one", "two"))
-    maps = [(folder / "manifest.jsonl").read_text() for folder in (tmp_path / "one", tmp_path / "two")]
+    lamps, folder = [lamp(0, 4, 0), lamp(2, 3, 0), lamp(0, 4, 0)], tmp_path_factory.mktemp("above")
+    one, two = (baked(scene, lamps, folder / name, **small) for name in ("one", "two"))
+    return scene, one, two
+
+
+def test_equal_seeds_give_equal_bits_and_a_body_lights_the_ground(above: tuple[Scene, Dataset, Dataset]) -> None:
+    """The floor's lamp-side is as with an opaque ball, its shadow is lit through the ball."""
+    _, one, two = above
+    maps = [(data.folder / "manifest.jsonl").read_text() for data in (one, two)]
     hashes = [[json.loads(line) for line in text.splitlines()] for text in maps]
     assert hashes[0] == hashes[1]
     ground = two.gbuffer["position"][:, 1] < -1.2
@@ -191,6 +234,83 @@ def test_equal_seeds_give_equal_bits_and_a_body_lights_the_ground(tmp_path: Any)
     assert shade.any()
     assert not two.maps("direct", [0])[0][shade].any()
     assert (one.maps("indirect", [0])[0][shade] > 0).all()
+
+
+# --- shown and exported ------------------------------------------------------------------------------------------------
+
+
+def test_pictures_show_no_diffuse_light_of_lamps_on_a_body(
+    above: tuple[Scene, Dataset, Dataset], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All that pictures are made of: the floor's direct light as it is, none on the ball, whose lit side has plenty."""
+    scene, data, _ = above
+    exitant, test = data.exitant, data.split("test")
+    assert exitant is not None
+    np.testing.assert_array_equal(exitant, data.gbuffer["position"][:, 1] > -1.2)
+    direct, seen = data.maps("direct", test)[0], list[np.ndarray]()
+    assert direct[exitant].max() > 0.1
+    lit = Scenery.lit
+
+    def told(light: np.ndarray, *_: Any) -> None:
+        seen.append(light)
+        raise InterruptedError  # all other pictures are of other things
+
+    def shown(self: Scenery, lighting: Any, light: np.ndarray, *more: Any) -> np.ndarray:
+        seen.append(light)
+        return lit(self, lighting, light, *more)
+
+    monkeypatch.setattr(Scenery, "lit", shown)
+    monkeypatch.setattr(shots, "Scenery", SimpleNamespace(of=partial(Scenery.of, height=24)))
+    monkeypatch.setattr(page, "take_view", partial(page.take_view, height=24))
+    monkeypatch.setattr(figures, "lighting_row", told)
+    model, config = ddprt.fit(data, bases=1), base(atlas__resolution=24)
+    with pytest.raises(InterruptedError):
+        page._pictures(evaluate(data, {"svd-ridge": model}, {}), data, "svd-ridge", model, config, scene)
+    assert len(seen) == 2
+    for light in seen:
+        assert not light[exitant].any()
+        np.testing.assert_array_equal(light[~exitant], direct[~exitant])
+
+
+def test_a_dataset_that_lost_its_exitant_texels_says_so(above: tuple[Scene, Dataset, Dataset]) -> None:
+    _, data, _ = above
+    other = replace(data, description={**data.description, "exitant": ["milk"]})
+    tensors = read_tensors(data.folder / "scene.safetensors")
+    write_tensors(data.folder / "scene.safetensors", {key: value for key, value in tensors.items() if key != "exitant"})
+    try:
+        with pytest.raises(UserError, match="got none exitant texels"):
+            other.shaded([0])
+    finally:
+        write_tensors(data.folder / "scene.safetensors", tensors)
+
+
+def test_engines_are_told_where_no_lamp_is_to_be_added(above: tuple[Scene, Dataset, Dataset], tmp_path: Any) -> None:
+    """By the decoder that the docs print, after a save and a load: albedo times direct light on the floor alone."""
+    _, data, _ = above
+    ddprt.fit(data, bases=1).save(tmp_path / "model")
+    model = ddprt.load_model(tmp_path / "model")
+    written = export_textures(model, tmp_path / "export")
+    assert {path.name for path in written} == {path.name for path in (tmp_path / "export").iterdir()}
+    blocks = re.findall(r"```python\n(.*?)```", (Path(__file__).parent.parent / "docs" / "export.md").read_text(), re.DOTALL)
+    scope: dict[str, Any] = {}
+    for name in ("def decode", "def leaving"):
+        exec(next(block for block in blocks if name in block), scope)
+    values, direct = data.values([0], 4, "radiosity")[0], model.image(data.maps("direct", [0])[0])
+    indirect, albedo = scope["decode"](tmp_path / "export", values), model.image(data.gbuffer["albedo"])
+    out = scope["leaving"](tmp_path / "export", albedo, direct, indirect)[model.covered]
+    ball, dark, learned = data.exitant, ~data.exitant, indirect[model.covered]
+    np.testing.assert_array_equal(out[ball], learned[ball])  # the ball's albedo is 1
+    np.testing.assert_array_equal(out[dark], data.gbuffer["albedo"][dark] * (data.maps("direct", [0])[0] + learned)[dark])
+    assert data.maps("direct", [0])[0][ball].max() > 0.1
+    mask = read_exr(tmp_path / "export" / "exitant.exr")[0]
+    assert set(np.unique(mask)) == {0, 1}
+    opaque = replace(model, exitant=None)
+    export_textures(opaque, tmp_path / "export")
+    assert not (tmp_path / "export" / "exitant.exr").exists()
+    assert "exitant" not in json.loads((tmp_path / "export" / "manifest.json").read_text())
+
+
+# --- refused -------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

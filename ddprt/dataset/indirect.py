@@ -41,8 +41,7 @@ class IndirectBake:
     """What all indirect maps of a dataset have in common.
 
     Held-out maps are the mean of two independent halves, texel by texel, and their half difference is kept as `noise`. Training
-    maps may share rays between neighbouring texels and spread them unevenly: cheaper, with a bias that is never let into what
-    scores are computed on.
+    maps may share rays between neighbouring texels and spread them unevenly: cheaper, with a bias that no score is told of.
     """
 
     config: Config
@@ -94,18 +93,20 @@ class IndirectBake:
         kinds = ["indirect", "noise"] if split == "test" else ["indirect"]
         if self._passing is None or not self.manifest.lacks(kinds, indices):
             return []
-        config, texels, found = self.config.transport, self._passing.texels, list[Leaving]()
-        given = config.test_samples if split == "test" else config.samples
-        with self.progress.stage(f"subsurface {split}", len(kinds) * len(texels)) as stage:
-            before = self.tracer.rays
+        config, texels, found, facts = self.config.transport, self._passing.texels, list[Leaving](), {}
+        given, before = config.test_samples if split == "test" else config.samples, self.tracer.rays
+        sharing = split != "test" and config.footprint > 0 and given != 1  # neighbours share walks where nothing is scored on
+        with self.progress.stage(f"subsurface {split}", (len(kinds) + sharing) * len(texels)) as stage:
             for half in range(len(kinds)):
                 light, address = sent(half).bounced.arrived, {"seed": self.config.seed, "stream": f"{split} {half}"}
                 if given == "auto":
                     each, noise = self._passing.choose(light, config.target_noise * len(kinds) ** 0.5, **address)
                     given = each * len(kinds)
                     stage.facts["noise_expected"] = float(f"{noise / len(kinds) ** 0.5:.3g}")
-                found.append((texels, self._passing.whole(light, max(1, given // len(kinds)), stage.advance, **address)))
-            stage.facts |= {"walks": given, "rays": self.tracer.rays - before}
+                leave = self._passing.borrowed if sharing else self._passing.whole
+                values, facts = leave(light, max(1, given // len(kinds)), stage.advance, **address)
+                found.append((texels, values))
+            stage.facts |= facts | {"walks": given, "rays": self.tracer.rays - before}
         return found
 
     def _maps(self, split: str, indices: list[int], sent: Callable[[int], Sent], leaving: list[Leaving]) -> None:
@@ -115,13 +116,13 @@ class IndirectBake:
             return
         with self.progress.stage(f"indirect {split}", len(kinds) * self.atlas.count) as stage:
             before = self.tracer.rays
-            stage.facts["integrator"] = self.dataset.description["transport"]["integrator"]
+            stage.facts["integrator"] = integrator = self.dataset.description["transport"]["integrator"]
             if self.effects.bounces == 0:
                 dark = np.zeros((len(indices), self.atlas.count, 3), np.float32)
                 self._finish([dark] * len(kinds), indices, todo, kinds, lambda light: light, leaving)
-            elif self.dataset.description["transport"]["integrator"] == "reference":
+            elif integrator == "reference":
                 self._by_reference(split, todo, kinds, stage)
-            elif self.dataset.description["transport"]["integrator"] == "paths":
+            elif integrator == "paths":
                 self._by_paths(split, indices, todo, kinds, stage)
             else:
                 self._by_operator(split, indices, todo, kinds, stage, sent, leaving)
@@ -266,10 +267,9 @@ class IndirectBake:
     ) -> None:
         """Writes the maps: the mean of two halves and half their difference, or what `last` makes of the only part.
 
-        What leaves bodies takes its place in them.
-
-        Where few rays meet something near, noise may reach below zero (transport/near.py). It ends here, which changes the
-        Cornell box's energy by 1.5e-5 at 8 rays per texel, by 8e-7 at 32 and not at all at the default noise.
+        What leaves bodies takes its place in them. Where few rays meet something near, noise may reach below zero
+        (transport/near.py). It ends here, which changes the Cornell box's energy by 1.5e-5 at 8 rays per texel, by 8e-7 at 32
+        and not at all at the default noise.
         """
 
         def finished(index: int) -> list[np.ndarray]:

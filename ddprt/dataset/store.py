@@ -26,6 +26,7 @@ from ddprt.scene.atlas import Atlas
 from ddprt.scene.exr import exposure_for, read_exr, write_exr
 from ddprt.scene.holes import Holes
 from ddprt.scene.mesh import Scene
+from ddprt.transport.translucency import exitant_texels
 
 SCHEMA = 1
 _GBUFFER = ("position", "normal", "geometric_normal", "albedo", "area", "coverage")
@@ -100,6 +101,29 @@ class Dataset:
     def uv(self) -> Float64[np.ndarray, "triangles 3 2"] | None:
         """Lightmap coordinates of these corners, origin top-left; None in bakes of older versions."""
         return read_tensors(self.folder / "scene.safetensors").get("uv")
+
+    @cached_property
+    def exitant(self) -> Bool[np.ndarray, " texels"] | None:
+        """Texels that hold all light that leaves them, not what arrives; None where none do.
+
+        Raises:
+          UserError: the description names such materials, and what is kept of the scene knows no such texels.
+        """
+        path = self.folder / "scene.safetensors"
+        found = read_tensors(path).get("exitant") if "exitant" in self.description else None
+        if "exitant" in self.description and (found is None or found.shape != (int(self.covered.sum()),)):
+            raise UserError(
+                f"{path}: got {'none' if found is None else len(found)} exitant texels, expected one entry for each covered "
+                "texel, since dataset.json names exitant materials; bake it again"
+            )
+        return None if found is None else found.astype(bool)
+
+    def shaded(self, indices: Sequence[int]) -> Float32[np.ndarray, "lightings texels 3"]:
+        """Direct light that surfaces scatter where it falls, W/m²: the maps, and 0 where all that leaves counts as indirect."""
+        values = self.maps("direct", indices)
+        if self.exitant is not None:
+            values[:, self.exitant] = 0
+        return values
 
     @cached_property
     def holes(self) -> Holes | None:
@@ -304,8 +328,9 @@ def write_atlas(folder: Path, atlas: Atlas, manifest: Manifest) -> None:
 
 def scene_tensors(scene: Scene, atlas: Atlas) -> dict[str, np.ndarray]:
     """What a dataset keeps of a scene: what casts shadows, and where it lies on the lightmap."""
-    holes = Holes.of(scene)
-    return {"corners": scene.corners, "uv": atlas.uv, **(holes.tensors if holes else {})}
+    holes, exitant = Holes.of(scene), exitant_texels(scene, atlas)
+    leaving = {"exitant": exitant} if exitant.any() else {}
+    return {"corners": scene.corners, "uv": atlas.uv, **leaving, **(holes.tensors if holes else {})}
 
 
 def write_description(folder: Path, description: dict[str, Any]) -> None:

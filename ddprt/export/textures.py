@@ -22,6 +22,7 @@ from ddprt.scene.gutter import fill_gutter
 SCHEMA = 1
 LAYER = 4  # bases per RGBA texture
 CONSTANT = "constant.exr"
+EXITANT = "exitant.exr"
 
 DECODE = [
     "home = points.home; x[p] = mean over samples k with home[k] == p of (albedo[k] *) E_direct[k], per colour channel",
@@ -35,6 +36,11 @@ DECODE = [
 ]
 
 GLOWING = "E = E_indirect + constant texture, added after the sum, the clamp, gamma and s: light of surfaces that glow"
+
+LEAVING = (
+    "where the exitant texture is 1, E is all light that leaves, before albedo, that of lamps which went through the body too: "
+    "add no diffuse reflection of lamps there"
+)
 
 TRUST = [
     "x as above, encoded: z; per channel for mono, over all for multi; weight of a channel w = s² / sum of s²",
@@ -94,7 +100,8 @@ def export_textures(
     layers += [("mean.exr", image) for image in mean]
     kept = {name for name, _ in layers}
     kept |= set() if constant is None else {CONSTANT}
-    for stale in [*folder.glob("basis_*.exr"), *folder.glob("mean.exr"), *folder.glob(CONSTANT)]:
+    kept |= set() if model.exitant is None else {EXITANT}
+    for stale in [*folder.glob("basis_*.exr"), *folder.glob("mean.exr"), *folder.glob(CONSTANT), *folder.glob(EXITANT)]:
         if stale.name not in kept:  # of an earlier export with more bases
             stale.unlink()
     for name, image in layers:
@@ -103,6 +110,9 @@ def export_textures(
     if constant is not None:  # in W/m², which halves may not reach
         write_exr(folder / CONSTANT, constant, half=False)
         written.append(folder / CONSTANT)
+    if model.exitant is not None:  # whole numbers in the gutter too, where charts of either kind meet
+        write_exr(folder / EXITANT, np.rint(_image(model, model.exitant.astype(np.float32), gutter)), half=True)
+        written.append(folder / EXITANT)
 
     points = {
         "position": model.samples.position,
@@ -147,11 +157,13 @@ def export_textures(
         "matrix": {"file": "transfer.safetensors", "axes": "rgb, bases, points" if mono else "1, bases, points * rgb"},
         "uv": "lightmap coordinates (TEXCOORD_1), origin top-left, row 0 at the top",
         "unit": "irradiance in W/m2, before albedo",
-        "decode": DECODE if constant is None else [*DECODE, GLOWING],
+        "decode": [*DECODE, *([] if constant is None else [GLOWING]), *([] if model.exitant is None else [LEAVING])],
         "trust": trust,
     }
     if constant is not None:
         manifest["constant"] = CONSTANT
+    if model.exitant is not None:
+        manifest["exitant"] = EXITANT
     write_text(folder / "manifest.json", json.dumps(manifest, indent=1, ensure_ascii=False) + "\n")
     return [*written, folder / "transfer.safetensors", folder / "points.json", folder / "manifest.json"]
 

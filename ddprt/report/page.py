@@ -246,7 +246,7 @@ def _pictures(
     truth, predicted, test = evaluation.truth, evaluation.predicted[main], data.split("test")
     errors, albedo, rows = truth.errors_per_lighting(predicted), data.gbuffer["albedo"], []
     for row, label in figures.choose_rows(errors, config.report.rows):
-        direct, reference = data.maps("direct", [test[row]])[0], truth.reference[row]
+        direct, reference = data.shaded([test[row]])[0], truth.reference[row]
         pictures = figures.lighting_row(direct, predicted[row], reference, albedo, data.covered, view)
         mean = float(np.average(reference.mean(1), weights=truth.weight))
         distance = float(evaluation.distance[row]) if len(evaluation.distance) else np.nan

@@ -76,7 +76,7 @@ def shots(
     rows = []
     for row, label in picked:
         index, lighting = test[row], data.lightings[test[row]]
-        direct, values = data.maps("direct", [index])[0], data.values([index], model.points, model.quantity)[0]
+        direct, values = data.shaded([index])[0], data.values([index], model.points, model.quantity)[0]
         ours = {name: part.predict(values, lightings=lighting) for name, part in model.layers.items()}
         reference = {layer.name: read_light(data, layer, [index])[0] for layer in layers}
         for name, part in model.layers.items():

@@ -48,6 +48,8 @@ class Model:
       layers: what answers for light besides the lightmap, by name of the layer.
       holes: where light passes through the occluders; None where it nowhere does.
       constant: irradiance of emissive surfaces, which no light changes, W/m²; None where nothing glows.
+      exitant: covered texels whose light is all that leaves them, to which no diffuse reflection of lamps comes; None where
+        there are none.
     """
 
     method: str
@@ -65,6 +67,7 @@ class Model:
     layers: "Mapping[str, LayerModel]" = field(default_factory=lambda: Catalogue("layer", {}))
     holes: Holes | None = None
     constant: np.ndarray | None = None
+    exitant: np.ndarray | None = None
 
     def predict(
         self,

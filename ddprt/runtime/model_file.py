@@ -96,6 +96,8 @@ def save_model(model: Model, folder: Path) -> None:
         tensors |= model.holes.tensors
     if model.constant is not None:
         tensors["light.constant"] = model.constant
+    if model.exitant is not None:
+        tensors["atlas.exitant"] = model.exitant
     trust: dict[str, float] = {}
     if model.yardstick is not None:
         for entry in fields(model.yardstick):
@@ -220,6 +222,9 @@ def _assemble(
     constant = tensors.get("light.constant")
     if constant is not None and constant.shape != (int(tensors["atlas.covered"].sum()), 3):
         raise ValueError(f"got constant light of shape {constant.shape}")
+    exitant = tensors.get("atlas.exitant")
+    if exitant is not None and exitant.shape != (int(tensors["atlas.covered"].sum()),):
+        raise ValueError(f"got exitant texels of shape {exitant.shape}")
     position, normal, albedo = (tensors[f"points.{name}"] for name in ("position", "normal", "albedo"))
     samples = Samples(position, normal, albedo, places.spacing, places.depth)
     return Model(
@@ -238,6 +243,7 @@ def _assemble(
         Catalogue("layer", {entry.name: _layer_model(entry, tensors, parts[entry.name]) for entry in checked.layers}),
         Holes.read(tensors, len(tensors["scene.corners"])),
         constant,
+        exitant,
     )
 
 

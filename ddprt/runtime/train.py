@@ -137,6 +137,7 @@ def fit_method(
         Catalogue("layer", of_layers),
         None if isinstance(data, LayerData) else data.holes,
         data.constant,
+        None if isinstance(data, LayerData) else data.exitant,
     )
 
 

@@ -3,8 +3,12 @@
 import numpy as np
 
 from ddprt.axes import Float, Float32
+from ddprt.compiled import compiled
 
+EXTRAPOLATED = 0.7104
+"""Free paths by which diffusion's boundary lies outside: Milne's constant."""
 _POINTS = 1 << 20  # spread at a time
+_BAND = 4  # cells about the surface in which distances are exact
 
 
 def decay_rate(albedo: float) -> float:
@@ -18,13 +22,19 @@ def decay_rate(albedo: float) -> float:
     return low
 
 
+def weight_of_jump(radius: float, extinction: float, albedo: float) -> float:
+    """What is left of light that starts evenly in a medium of even scattering when it first comes so far, metres."""
+    x = decay_rate(albedo) * (radius * extinction + EXTRAPOLATED)
+    return float(x / np.sinh(x)) if x > 0 else 1.0
+
+
 def depths(
     corners: Float32[np.ndarray, "triangles 3 3"], low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], cell: float
 ) -> tuple[Float32[np.ndarray, "x y z"], float]:
-    """Lower bounds of the distance from the centres of cubic cells to a surface, and the edge of the cells, metres.
+    """Squared distances from the centres of cubic cells to a surface, square metres, and the edge of the cells, metres.
 
-    Points are spread over the surface so that none of it is further from one than half an edge over the root of three; cells
-    that hold one count as the surface, wherever in them it is.
+    Exact within a few cells of it, lower bounds elsewhere. These come from points that are spread over the surface so that none
+    of it is further from one than half an edge over the root of three; cells that hold one count as surface, wherever it is.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -40,4 +50,50 @@ def depths(
             clear[tuple(np.clip(((spread - low) / cell).astype(int), 0, size - 1).T)] = False
     distance = cell * distance_transform_edt(clear)
     slack = cell * (3**0.5 / 2 + 0.5 / 3**0.5)
-    return np.maximum(distance - slack, 0).astype(np.float32), cell
+    squared = np.maximum(distance - slack, 0).astype(np.float32) ** 2
+    exact = np.full(size, np.float32((_BAND * cell) ** 2))  # what lies outside of all boxes is at least so far
+    _approach(corners.astype(np.float32), low.astype(np.float32), np.float32(cell), exact)
+    return np.maximum(squared, exact), cell
+
+
+@compiled
+def _approach(corners: np.ndarray, low: np.ndarray, cell: np.float32, squared: np.ndarray) -> None:
+    """Lowers squared distances of the cells about each triangle to that of the triangle."""
+    half, band = np.float32(0.5), np.float32(_BAND) * cell
+    first, last = np.empty(3, np.int64), np.empty(3, np.int64)
+    for t in range(len(corners)):
+        for axis in range(3):
+            least = min(corners[t, 0, axis], corners[t, 1, axis], corners[t, 2, axis]) - band
+            most = max(corners[t, 0, axis], corners[t, 1, axis], corners[t, 2, axis]) + band
+            first[axis] = max(0, int((least - low[axis]) / cell - half))
+            last[axis] = min(squared.shape[axis] - 1, int((most - low[axis]) / cell + half))
+        for i in range(first[0], last[0] + 1):
+            for j in range(first[1], last[1] + 1):
+                for k in range(first[2], last[2] + 1):
+                    x, y = low[0] + (i + half) * cell, low[1] + (j + half) * cell
+                    found = _squared_distance(corners[t], x, y, low[2] + (k + half) * cell)
+                    squared[i, j, k] = min(squared[i, j, k], found)
+
+
+@compiled
+def _squared_distance(corner: np.ndarray, x: np.float32, y: np.float32, z: np.float32) -> np.float32:
+    """From a point to a triangle: to its plane where the foot is inside, else to the nearest of its edges."""
+    zero, one = np.float32(0), np.float32(1)
+    best, inside = np.float32(np.inf), True
+    ux, uy, uz = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
+    vx, vy, vz = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
+    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    for a in range(3):
+        b = (a + 1) % 3
+        ex, ey, ez = corner[b, 0] - corner[a, 0], corner[b, 1] - corner[a, 1], corner[b, 2] - corner[a, 2]
+        px, py, pz = x - corner[a, 0], y - corner[a, 1], z - corner[a, 2]
+        inside = inside and (ny * ez - nz * ey) * px + (nz * ex - nx * ez) * py + (nx * ey - ny * ex) * pz >= zero
+        length = ex * ex + ey * ey + ez * ez
+        along = min(max((px * ex + py * ey + pz * ez) / length, zero), one) if length > zero else zero
+        px, py, pz = px - along * ex, py - along * ey, pz - along * ez
+        best = min(best, px * px + py * py + pz * pz)
+    size = nx * nx + ny * ny + nz * nz
+    if inside and size > zero:
+        height = (x - corner[0, 0]) * nx + (y - corner[0, 1]) * ny + (z - corner[0, 2]) * nz
+        best = min(best, height * height / size)
+    return best

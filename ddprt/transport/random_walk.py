@@ -1,17 +1,17 @@
 """Random walks of light through a homogeneous medium that fills a closed body, from the surface to the surface.
 
-Compiled code draws how far each walk flies, and scatters it, for as long as it surely stays inside; Embree tells whether the
-surface comes first where it may, for all walks of a call together. One walk serves all channels: for each flight a channel is
-drawn in proportion to the walk's weights, and each weight is multiplied by its own channel's chance over that of the draw (the
-balance heuristic). So no weight leaves its bounds: their sum never grows.
+Compiled code draws how far each walk flies, and scatters it, for as long as a grid of depths says that it stays inside; Embree
+tells whether the surface comes first where it may, for all walks of a call together. One walk serves all channels: for each
+flight a channel is drawn in proportion to the walk's weights, and each weight is multiplied by its own channel's chance over
+that of the draw (the balance heuristic). So no weight leaves its bounds: their sum never grows.
 
 A thick body would keep walks for ever. Two things shorten them. Once a direction is forgotten (the anisotropy to the power of
 the scatterings is below `_FORGOTTEN`) the medium becomes the similar one that scatters evenly, sigma_s' = (1 - g) sigma_s. And
 where the surface is further than `FAR` of its free paths, a walk goes at once to a sphere about it that just fits, where it
 comes first with equal odds everywhere: a step of the walk on spheres for diffusion (Muller, "Some Continuous Monte Carlo
 Methods for the Dirichlet Problem", 1956). What it lost on the way is x / sinh x with x = (radius + 0.71 free paths) / the
-diffusion length (see `weight_of_jump`), and directions there lean outwards as in Milne's problem. Both are measured in
-docs/effects.md. Light weaker than `_FAINT` plays roulette.
+diffusion length (see `diffusion.weight_of_jump`), and directions there lean outwards as in Milne's problem. Both are measured
+in docs/effects.md. Light weaker than `_FAINT` plays roulette.
 """
 
 from dataclasses import dataclass
@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from ddprt.axes import Float, Float32, Float64, Int32
+from ddprt.axes import Float32, Int32
 from ddprt.compiled import compiled
 from ddprt.scene.material import Subsurface
-from ddprt.transport.diffusion import decay_rate, depths
+from ddprt.transport.diffusion import EXTRAPOLATED, decay_rate, depths
 from ddprt.transport.packets import Geometry
 
 FAR = 3.0
@@ -35,12 +35,11 @@ WHITE = 0.9
 LEANING = 0.707, 0.26
 """Mean cosine, to the normal, of light that comes first to a sphere: Milne's, and what 1 / (radius in free paths) adds."""
 
-EXTRAPOLATED = 0.7104
-"""Free paths by which diffusion's boundary lies outside: Milne's constant."""
-
 _FORGOTTEN = 0.05
 _FAINT = 0.5  # of a sum of three weights
 _CELLS = 160  # of the grid of depths, along the body's longest side, at most
+_STEP = 0.25  # cells; where the surface is nearer to a flight than that, a ray tells which of them comes first
+_ROUNDING = 1e-5  # of a cell's squared edge
 _MOST = 200_000  # rays of a walk; only a white body in which light is caught reaches them
 
 
@@ -81,7 +80,7 @@ class Body:
       anisotropy, index: see `Subsurface`.
       switch: scatterings after which a walk goes through the similar medium.
       far: depth from which on it jumps, metres.
-      depth: lower bounds of the distance from cell centres to the surface, metres.
+      depth: lower bounds of the squared distance from cell centres to the surface, m²; exact near it.
       low, cell: corner of that grid and edge of its cells, metres.
       bounds: of the corners, with a margin.
     """
@@ -125,7 +124,8 @@ class Body:
         low, high = corners.min((0, 1)), corners.max((0, 1))
         far = FAR / float(similar.min()) if jumps and even.min() >= WHITE else np.inf
         finest = max(float((high - low).max()) / _CELLS, 0.5 / float(similar.max()))
-        depth, cell = depths(corners, low, high, finest)
+        within = low - finest, high + finest  # so that all of the body lies between centres
+        depth, cell = depths(corners, *within, finest)
         bounds = np.stack([low, high]) + np.array([[-10.0], [10.0]]) * offset
         return cls(
             Geometry(corners),
@@ -140,7 +140,7 @@ class Body:
             switch if jumps else np.iinfo(np.int32).max,
             far,
             depth,
-            low.astype(np.float32),
+            within[0].astype(np.float32),
             cell,
             bounds.astype(np.float32),
         )
@@ -189,32 +189,9 @@ class Body:
         return Exits(which[:, 0].copy(), which[:, 1].copy(), at[0], at[1], towards, flat[:, 3:].copy(), rays, lost + count)
 
 
-def weight_of_jump(radius: float, extinction: float, albedo: float) -> float:
-    """What is left of light that starts evenly in a medium of even scattering when it first comes so far, metres."""
-    x = decay_rate(albedo) * (radius * extinction + EXTRAPOLATED)
-    return float(x / np.sinh(x)) if x > 0 else 1.0
-
-
-def sample_henyey(u: Float64[np.ndarray, " n"], anisotropy: float) -> Float64[np.ndarray, " n"]:
-    """Cosines of the angle of scattering, as walks draw them."""
-    return np.array([_henyey(np.float32(one), np.float32(anisotropy)) for one in u], np.float64)
-
-
-def pdf_henyey(cosine: Float[np.ndarray, " n"], anisotropy: float) -> Float[np.ndarray, " n"]:
-    """Per steradian. Reference: Henyey and Greenstein, "Diffuse Radiation in the Galaxy", 1941."""
-    return (1 - anisotropy**2) / (4 * np.pi * (1 + anisotropy**2 - 2 * anisotropy * cosine) ** 1.5)
-
-
-def invert_henyey(cosine: Float[np.ndarray, " n"], anisotropy: float) -> Float[np.ndarray, " n"]:
-    """The uniform numbers that give these cosines."""
-    g = anisotropy
-    if abs(g) < 1e-3:
-        return (1 + cosine) / 2
-    return ((1 - g * g) / np.sqrt(1 + g * g - 2 * g * cosine) - 1 + g) / (2 * g)
-
-
 @compiled
-def _henyey(u: np.float32, g: np.float32) -> np.float32:
+def scattered_at(u: np.float32, g: np.float32) -> np.float32:
+    """The cosine of an angle of scattering; see `ddprt.transport.meetings`."""
     one, two = np.float32(1), np.float32(2)
     if abs(g) < np.float32(1e-3):
         return two * u - one
@@ -223,7 +200,13 @@ def _henyey(u: np.float32, g: np.float32) -> np.float32:
 
 
 @compiled
-def _drawn(state: np.ndarray, i: int) -> np.float32:
+def flown(u: np.float32, extinction: np.float32) -> np.float32:
+    """The length of a flight, metres; see `ddprt.transport.meetings`."""
+    return -np.log(np.float32(1) - u) / extinction
+
+
+@compiled
+def drawn(state: np.ndarray, i: int) -> np.float32:
     """The next of a walk's own uniform numbers (SplitMix64)."""
     state[i] += np.uint64(0x9E3779B97F4A7C15)
     bits = state[i]
@@ -234,14 +217,24 @@ def _drawn(state: np.ndarray, i: int) -> np.float32:
 
 @compiled
 def _free(x: np.float32, y: np.float32, z: np.float32, depth: np.ndarray, low: np.ndarray, cell: np.float32) -> np.float32:
-    """A lower bound of the distance to the surface."""
-    half = np.float32(0.5)
-    p, q, r = (x - low[0]) / cell, (y - low[1]) / cell, (z - low[2]) / cell
+    """A lower bound of the distance to the surface.
+
+    The square of a distance less that of the place is a least value of linear functions, so it is nowhere less than what is
+    interpolated: the squares of distances about a place, averaged trilinearly, less those of the centres from the place.
+    """
+    half, one = np.float32(0.5), np.float32(1)
+    p, q, r = (x - low[0]) / cell - half, (y - low[1]) / cell - half, (z - low[2]) / cell - half
     i, j, k = int(p), int(q), int(r)
-    if p < 0 or q < 0 or r < 0 or i >= depth.shape[0] or j >= depth.shape[1] or k >= depth.shape[2]:
+    if p < 0 or q < 0 or r < 0 or i + 1 >= depth.shape[0] or j + 1 >= depth.shape[1] or k + 1 >= depth.shape[2]:
         return np.float32(0)
-    p, q, r = p - i - half, q - j - half, r - k - half
-    return depth[i, j, k] - cell * np.sqrt(p * p + q * q + r * r)
+    p, q, r = p - i, q - j, r - k
+    a = (one - r) * depth[i, j, k] + r * depth[i, j, k + 1]
+    b = (one - r) * depth[i, j + 1, k] + r * depth[i, j + 1, k + 1]
+    c = (one - r) * depth[i + 1, j, k] + r * depth[i + 1, j, k + 1]
+    d = (one - r) * depth[i + 1, j + 1, k] + r * depth[i + 1, j + 1, k + 1]
+    mean = (one - p) * ((one - q) * a + q * b) + p * ((one - q) * c + q * d)
+    spread = p * (one - p) + q * (one - q) + r * (one - r) + np.float32(_ROUNDING)
+    return np.sqrt(max(mean - spread * cell * cell, np.float32(0)))
 
 
 @compiled
@@ -298,7 +291,7 @@ def _advance(
       How many go on, how many have left so far, how many were lost.
     """
     zero, one, two = np.float32(0), np.float32(1), np.float32(2)
-    faint, milne = np.float32(_FAINT), np.float32(EXTRAPOLATED)
+    faint, milne, least_step = np.float32(_FAINT), np.float32(EXTRAPOLATED), np.float32(_STEP) * cell
     count, lost = 0, 0
     for i in range(len(triangle)):
         px, py, pz = position[i, 0], position[i, 1], position[i, 2]
@@ -311,9 +304,14 @@ def _advance(
                 t, hit = reach[i], triangle[i]
                 met = False
             else:
-                pick = _drawn(state, i) * (a + b + c)
+                pick = drawn(state, i) * (a + b + c)
                 channel = 0 if pick < a else (1 if pick < a + b else 2)
-                t, hit = -np.log(one - _drawn(state, i)) / extinction[stage, channel], np.int32(-1)
+                t, hit = flown(drawn(state, i), extinction[stage, channel]), np.int32(-1)
+                while free < t:
+                    step = _free(px + free * x, py + free * y, pz + free * z, depth, low, cell)
+                    if step < least_step:
+                        break
+                    free += step
                 if t >= free:
                     position[count, 0], position[count, 1], position[count, 2] = px, py, pz
                     direction[count, 0], direction[count, 1], direction[count, 2] = x, y, z
@@ -343,7 +341,7 @@ def _advance(
                         across = (outer - index * cosine) / (outer + index * cosine)
                         along = (index * outer - cosine) / (index * outer + cosine)
                         reflected = (across * across + along * along) / two
-                if _drawn(state, i) >= reflected:
+                if drawn(state, i) >= reflected:
                     which[left, 0], which[left, 1] = owner[i], hit
                     weights[left, 0], weights[left, 1] = u[i], v[i]
                     bend = outer - index * cosine
@@ -368,22 +366,22 @@ def _advance(
                 break
             total = a + b + c
             if total < faint:
-                if _drawn(state, i) * faint >= total:
+                if drawn(state, i) * faint >= total:
                     break
                 share = faint / total
                 a, b, c = a * share, b * share, c * share
-            cosine = _henyey(_drawn(state, i), zero if stage else anisotropy)
-            x, y, z = _turned(x, y, z, cosine, _drawn(state, i))
+            cosine = scattered_at(drawn(state, i), zero if stage else anisotropy)
+            x, y, z = _turned(x, y, z, cosine, drawn(state, i))
             times += 1
             free = _free(px, py, pz, depth, low, cell)
             if free > far and times >= switch:
                 # Evenly anywhere on the sphere, and on from there as light leaves a thick wall.
-                x, y, z = _turned(zero, zero, one, two * _drawn(state, i) - one, _drawn(state, i))
+                x, y, z = _turned(zero, zero, one, two * drawn(state, i) - one, drawn(state, i))
                 px, py, pz = px + free * x, py + free * y, pz + free * z
                 widest = max(one / extinction[1, 0], one / extinction[1, 1], one / extinction[1, 2])
                 mean = np.float32(LEANING[0]) + np.float32(LEANING[1]) * widest / free
                 power = (one - mean) / mean  # of a density mu^k with that mean: k + 1 = mean / (1 - mean)
-                x, y, z = _turned(x, y, z, _drawn(state, i) ** power, _drawn(state, i))
+                x, y, z = _turned(x, y, z, drawn(state, i) ** power, drawn(state, i))
                 a *= _survival(decay[0] * (free + milne / extinction[1, 0]))
                 b *= _survival(decay[1] * (free + milne / extinction[1, 1]))
                 c *= _survival(decay[2] * (free + milne / extinction[1, 2]))

@@ -25,6 +25,7 @@ from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
 from ddprt.transport.direct import BLOCK, centred
 from ddprt.transport.embree import Tracer, lifted
+from ddprt.transport.footprint import Footprints, find_footprints
 from ddprt.transport.gather import Landing, Receivers, landed_on
 from ddprt.transport.random_walk import Body
 from ddprt.transport.refraction import entered, fresnel, mean_entering
@@ -33,6 +34,8 @@ from ddprt.transport.translucency import filled
 _SENDER_WALKS = 64  # of each sender: their noise is averaged once more by what sees it
 _PROBED, _PILOT = 512, 32  # texels, and walks of each in two independent runs, that predict how many are needed
 _LEAST, _MOST = 16, 8192  # walks per texel that "auto" may choose
+_SHARED = 0.0, 0.4, 0.5, 0.6, 0.75, 1.0  # standard deviations, in texels, of footprints that may share walks
+_JUDGED = 32  # lightings that tell which is best
 _ANGLES = 4  # places of a texel where the angle of lamps is looked at
 
 Matrix = Any
@@ -152,14 +155,71 @@ class Inside:
         *,
         seed: int,
         stream: str,
-    ) -> Float32[np.ndarray, "lightings inside 3"]:
-        """The same of all texels of bodies at once; `told` hears of each tile's number of texels."""
+    ) -> tuple[Float32[np.ndarray, "lightings inside 3"], dict[str, float]]:
+        """The same of all texels of bodies at once, and no facts; `told` hears of each tile's number of texels."""
         values, first = np.empty((arrived.shape[1] // 3, len(self.texels), 3), np.float32), 0
         for tile, light in self.leave(arrived, samples, seed=seed, stream=stream):
             values[:, first : first + len(tile)] = light
             first += len(tile)
             told(len(tile))
-        return values
+        return values, {}
+
+    def borrowed(
+        self,
+        arrived: Float32[np.ndarray, "senders columns"],
+        samples: int,
+        told: Callable[[int], Any],
+        *,
+        seed: int,
+        stream: str,
+    ) -> tuple[Float32[np.ndarray, "lightings inside 3"], dict[str, float]]:
+        """The same from two halves of the walks, with what `shared` makes of them; `told` hears of each texel twice."""
+        each = samples - samples // 2, samples // 2
+        address = ({"seed": seed, "stream": f"{stream} part {part}"} for part in range(2))
+        return self.shared(*(self.whole(arrived, walks, told, **one)[0] for walks, one in zip(each, address, strict=True)))
+
+    def shared(
+        self, one: Float32[np.ndarray, "lightings inside 3"], other: Float32[np.ndarray, "lightings inside 3"]
+    ) -> tuple[Float32[np.ndarray, "lightings inside 3"], dict[str, float]]:
+        """The mean of two independent halves, texels sharing walks with neighbours as far as the halves say that it pays.
+
+        A mean over neighbours trades noise for detail. The halves tell both: their difference what noise it leaves, and the
+        product of what it changes in one and in the other, whose noise is independent, how much detail it takes.
+
+        Args:
+          one, other: light that leaves all texels of bodies, from `whole`.
+        Returns:
+          The light; standard deviation of the footprints in texels, and relative RMSE to expect, noise and lost detail.
+        """
+        count = one.shape[0]
+        some = np.unique(np.linspace(0, count - 1, min(count, _JUDGED)).astype(int))
+        weight = self.atlas.area[self.texels] / self.atlas.area[self.texels].sum()
+
+        def mean(values: np.ndarray) -> float:
+            return float(np.einsum("tc,t->", values.reshape(len(values), -1), weight, dtype=np.float64) / values[0].size)
+
+        def beside(light: np.ndarray) -> np.ndarray:
+            return np.ascontiguousarray(light.swapaxes(0, 1).reshape(len(self.texels), -1))
+
+        a, b = beside(one[some]), beside(other[some])
+        errors = [mean((a - b) ** 2) / 4]
+        for share in _SHARED[1:]:
+            near = self._footprints(share)
+            c, d = near.pooled(a), near.pooled(b)
+            errors.append(max(mean((c - a) * (d - b)), 0.0) + mean((c - d) ** 2) / 4)
+        best, level = int(np.argmin(errors)), max(mean(a) / 2 + mean(b) / 2, float(np.finfo(np.float32).tiny))
+        light = (one + other) / 2
+        if best:
+            pooled = self._footprints(_SHARED[best]).pooled(beside(light))
+            light = np.ascontiguousarray(pooled.reshape(len(self.texels), -1, 3).swapaxes(0, 1))
+        return light, {"shared_over": _SHARED[best], "error_expected": float(f"{errors[best] ** 0.5 / level:.3g}")}
+
+    def _footprints(self, share: float) -> Footprints:
+        """Of the texels of bodies alone, with a standard deviation in texels."""
+        wide = find_footprints(self.atlas, np.full(self.atlas.count, self.atlas.texels_per_metre), share)
+        own = np.full(self.atlas.count + 1, -1, np.int32)  # the last is that of no texel
+        own[self.texels] = np.arange(len(self.texels))
+        return Footprints(wide.weight[self.texels], own[wide.slot], wide.centre[self.texels])
 
     def choose(
         self, arrived: Float32[np.ndarray, "senders columns"], target: float, *, seed: int, stream: str

@@ -5,7 +5,11 @@ What simulates them is `ddprt.transport.subsurface`, which is imported where the
 
 from dataclasses import replace
 
+import numpy as np
+
+from ddprt.axes import Bool
 from ddprt.errors import UserError
+from ddprt.scene.atlas import Atlas
 from ddprt.scene.material import Material
 from ddprt.scene.mesh import Scene
 
@@ -14,6 +18,13 @@ def filled(scene: Scene) -> tuple[bool, ...]:
     """Which of a scene's materials are in use and filled with a medium."""
     used = set(map(id, scene.used_materials))
     return tuple(entry.subsurface is not None and id(entry) in used for entry in scene.materials)
+
+
+def exitant_texels(scene: Scene, atlas: Atlas) -> Bool[np.ndarray, " texels"]:
+    """Which texels lie on such materials; pieces of a texel share its chart, and so its body."""
+    found = np.zeros(atlas.count, bool)
+    found[atlas.piece_texel] = np.array(filled(scene))[scene.material[atlas.piece_triangle]]
+    return found
 
 
 def opaque(material: Material) -> Material:
