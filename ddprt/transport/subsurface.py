@@ -174,9 +174,11 @@ class Inside:
         stream: str,
     ) -> tuple[Float32[np.ndarray, "lightings inside 3"], dict[str, float]]:
         """The same from two halves of the walks, with what `shared` makes of them; `told` hears of each texel twice."""
-        each = samples - samples // 2, samples // 2
-        address = ({"seed": seed, "stream": f"{stream} part {part}"} for part in range(2))
-        return self.shared(*(self.whole(arrived, walks, told, **one)[0] for walks, one in zip(each, address, strict=True)))
+        one, other = (
+            self.whole(arrived, walks, told, seed=seed, stream=f"{stream} part {part}")[0]
+            for part, walks in enumerate((samples - samples // 2, samples // 2))
+        )
+        return self.shared(one, other)
 
     def shared(
         self, one: Float32[np.ndarray, "lightings inside 3"], other: Float32[np.ndarray, "lightings inside 3"]
