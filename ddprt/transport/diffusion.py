@@ -59,20 +59,25 @@ def depths(
 @compiled
 def _approach(corners: np.ndarray, low: np.ndarray, cell: np.float32, squared: np.ndarray) -> None:
     """Lowers squared distances of the cells about each triangle to that of the triangle."""
-    half, band = np.float32(0.5), np.float32(_BAND) * cell
+    half, band, none = np.float32(0.5), np.float32(_BAND) * cell, np.float32(0)
+    least, most = np.empty(3, np.float32), np.empty(3, np.float32)
     first, last = np.empty(3, np.int64), np.empty(3, np.int64)
     for t in range(len(corners)):
         for axis in range(3):
-            least = min(corners[t, 0, axis], corners[t, 1, axis], corners[t, 2, axis]) - band
-            most = max(corners[t, 0, axis], corners[t, 1, axis], corners[t, 2, axis]) + band
-            first[axis] = max(0, int((least - low[axis]) / cell - half))
-            last[axis] = min(squared.shape[axis] - 1, int((most - low[axis]) / cell + half))
+            least[axis] = min(corners[t, 0, axis], corners[t, 1, axis], corners[t, 2, axis])
+            most[axis] = max(corners[t, 0, axis], corners[t, 1, axis], corners[t, 2, axis])
+            first[axis] = max(0, int((least[axis] - band - low[axis]) / cell - half))
+            last[axis] = min(squared.shape[axis] - 1, int((most[axis] + band - low[axis]) / cell + half))
         for i in range(first[0], last[0] + 1):
+            x = low[0] + (i + half) * cell
+            away = max(least[0] - x, x - most[0], none) ** 2
             for j in range(first[1], last[1] + 1):
+                y = low[1] + (j + half) * cell
+                further = away + max(least[1] - y, y - most[1], none) ** 2
                 for k in range(first[2], last[2] + 1):
-                    x, y = low[0] + (i + half) * cell, low[1] + (j + half) * cell
-                    found = _squared_distance(corners[t], x, y, low[2] + (k + half) * cell)
-                    squared[i, j, k] = min(squared[i, j, k], found)
+                    z = low[2] + (k + half) * cell
+                    if further + max(least[2] - z, z - most[2], none) ** 2 < squared[i, j, k]:  # to the box about it
+                        squared[i, j, k] = min(squared[i, j, k], _squared_distance(corners[t], x, y, z))
 
 
 @compiled

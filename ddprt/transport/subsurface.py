@@ -141,10 +141,8 @@ class Inside:
         first = 0
         for rows in self._rows(receivers, seed, f"{stream} inside"):
             count = rows[0].shape[0]
-            yield (
-                wanted[first : first + count],
-                Passage(rows, self.senders, self.largest).of(arrived).reshape(count, -1, 3).swapaxes(0, 1),
-            )
+            light = Passage(rows, self.senders, self.largest).of(arrived).reshape(count, -1, 3)
+            yield wanted[first : first + count], light.swapaxes(0, 1)
             first += count
 
     def whole(
