@@ -26,7 +26,7 @@ HELD = 23
 _DARKEST = 1e-4  # colours below it absorb as it does: the logarithm of nothing has no bound
 _CLARITIES, _ANGLES, _SEEN, _ACROSS = 65, 257, 256, 64  # of the table of gains, and of the sums that make it
 _GRAZING = 1e-4  # cosine: of a fibre seen along itself nothing is seen
-_SIN, _COS, _TURN, _PASS = 0, 4, 8, 11  # rows of what is held: four tilts, three angles, three channels of four lobes
+SIN, COS, TURN, PASS = 0, 4, 8, 11  # rows of what is held: four tilts, three angles, three channels of four lobes
 
 Numbers = Float[np.ndarray, "n channels"]
 Shape = Float64[np.ndarray, "6"]
@@ -104,7 +104,7 @@ def gains(fibre: Fibre) -> Float64[np.ndarray, "clarities angles"]:
     found = np.zeros((_CLARITIES, _ANGLES))
     for direction in seen:
         held = prepared(np.full(len(offset), np.sin(direction)), offset, absorption, fibre)
-        passed = held[:, _PASS::3].reshape(_CLARITIES, _ACROSS, 4).mean(1, dtype=np.float64)
+        passed = held[:, PASS::3].reshape(_CLARITIES, _ACROSS, 4).mean(1, dtype=np.float64)
         _add_gain(passed, held[0].astype(np.float64), shape, angle, np.cos(direction) ** 2 * np.pi / _SEEN, found)
     return found
 
@@ -128,7 +128,7 @@ def _add_gain(
     for j in range(len(angles)):
         sine, cosine = np.sin(angles[j]), np.cos(angles[j])
         for p in range(4):
-            density = weight * _longitudinal(sine, cosine, held[_SIN + p], held[_COS + p], shape[p])
+            density = weight * _longitudinal(sine, cosine, held[SIN + p], held[COS + p], shape[p])
             for i in range(len(passed)):
                 found[i, j] += density * passed[i, p]
 
@@ -158,23 +158,23 @@ def _prepare(
         cosine = np.sqrt(max(1 - sine * sine, 1e-12))
         h = min(max(float(offset[i]), -1.0), 1.0)
         for p in range(4):
-            held[i, _SIN + p] = sine * cosines[p] + cosine * sines[p]
-            held[i, _COS + p] = abs(cosine * cosines[p] - sine * sines[p])
+            held[i, SIN + p] = sine * cosines[p] + cosine * sines[p]
+            held[i, COS + p] = abs(cosine * cosines[p] - sine * sines[p])
         refracted = np.sqrt(max(index * index - sine * sine, 1e-12)) / cosine  # index for what is seen across the fibre
         bent = h / refracted
         entering, inside = np.arcsin(h), np.arcsin(bent)
         for p in range(3):
-            held[i, _TURN + p] = 2 * p * inside - 2 * entering + p * np.pi
+            held[i, TURN + p] = 2 * p * inside - 2 * entering + p * np.pi
         chord = 2 * np.sqrt(1 - bent * bent) / np.sqrt(1 - sine * sine / (index * index))
         mirrored = _fresnel(cosine * np.sqrt(max(1 - h * h, 0.0)), index)
         for channel in range(3):
             passed = np.exp(-absorption[i, channel] * chord)
             through = (1 - mirrored) * (1 - mirrored) * passed
             back = mirrored * passed
-            held[i, _PASS + channel] = mirrored
-            held[i, _PASS + 3 + channel] = through
-            held[i, _PASS + 6 + channel] = through * back
-            held[i, _PASS + 9 + channel] = through * back * back / (1 - back) if back < 1 else 0.0
+            held[i, PASS + channel] = mirrored
+            held[i, PASS + 3 + channel] = through
+            held[i, PASS + 6 + channel] = through * back
+            held[i, PASS + 9 + channel] = through * back * back / (1 - back) if back < 1 else 0.0
 
 
 @compiled
@@ -204,8 +204,8 @@ def _azimuthal(angle: float, scale: float, left: float) -> float:
 @compiled
 def _lobe(held: np.ndarray, shape: np.ndarray, p: int, sine: float, cosine: float, angle: float) -> float:
     """Density of a direction in one lobe, per steradian."""
-    flat = _longitudinal(sine, cosine, held[_SIN + p], held[_COS + p], shape[p])
-    return flat * (_azimuthal(angle - held[_TURN + p], shape[4], shape[5]) if p < 3 else 0.5 / np.pi)
+    flat = _longitudinal(sine, cosine, held[SIN + p], held[COS + p], shape[p])
+    return flat * (_azimuthal(angle - held[TURN + p], shape[4], shape[5]) if p < 3 else 0.5 / np.pi)
 
 
 @compiled
@@ -213,9 +213,9 @@ def _chance(held: np.ndarray, p: int) -> float:
     """Of a lobe: its share of what leaves, all channels together."""
     total, own = 0.0, 0.0
     for channel in range(3):
-        own += held[_PASS + 3 * p + channel]
+        own += held[PASS + 3 * p + channel]
         for q in range(4):
-            total += held[_PASS + 3 * q + channel]
+            total += held[PASS + 3 * q + channel]
     return own / total
 
 
@@ -227,9 +227,9 @@ def _phase(held: np.ndarray, shape: np.ndarray, incoming: np.ndarray, found: np.
         red, green, blue = 0.0, 0.0, 0.0
         for p in range(4):
             density = _lobe(held[i], shape, p, sine, cosine, angle)
-            red += density * held[i, _PASS + 3 * p]
-            green += density * held[i, _PASS + 3 * p + 1]
-            blue += density * held[i, _PASS + 3 * p + 2]
+            red += density * held[i, PASS + 3 * p]
+            green += density * held[i, PASS + 3 * p + 1]
+            blue += density * held[i, PASS + 3 * p + 2]
         found[i, 0], found[i, 1], found[i, 2] = red, green, blue
 
 
@@ -258,13 +258,13 @@ def _sample(held: np.ndarray, shape: np.ndarray, u: np.ndarray, directions: np.n
         on_cone = 1 + variance * np.log(height + (1 - height) * np.exp(-2 / variance))
         off_cone = np.sqrt(max(0.0, 1 - on_cone * on_cone))
         turned = np.cos(2 * np.pi * u[i, 2])
-        sine = -on_cone * held[i, _SIN + p] + off_cone * turned * held[i, _COS + p]
+        sine = -on_cone * held[i, SIN + p] + off_cone * turned * held[i, COS + p]
         sine = min(max(sine, -1.0), 1.0)
         cosine = np.sqrt(1 - sine * sine)
         if p < 3:
             least = 1 / (1 + np.exp(np.pi / shape[4]))
             number = min(max(least + float(u[i, 3]) * shape[5], 1e-300), 1 - 1e-16)
-            angle = float(held[i, _TURN + p]) - shape[4] * np.log(1 / number - 1)
+            angle = float(held[i, TURN + p]) - shape[4] * np.log(1 / number - 1)
         else:
             angle = 2 * np.pi * u[i, 3]
         directions[i, 0], directions[i, 1], directions[i, 2] = sine, cosine * np.cos(angle), cosine * np.sin(angle)
@@ -272,8 +272,8 @@ def _sample(held: np.ndarray, shape: np.ndarray, u: np.ndarray, directions: np.n
         for q in range(4):
             density = _lobe(held[i], shape, q, sine, cosine, angle)
             total += _chance(held[i], q) * density
-            red += density * held[i, _PASS + 3 * q]
-            green += density * held[i, _PASS + 3 * q + 1]
-            blue += density * held[i, _PASS + 3 * q + 2]
+            red += density * held[i, PASS + 3 * q]
+            green += density * held[i, PASS + 3 * q + 1]
+            blue += density * held[i, PASS + 3 * q + 2]
         total = max(total, 1e-30)
         weight[i, 0], weight[i, 1], weight[i, 2] = red / total, green / total, blue / total

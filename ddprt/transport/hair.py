@@ -12,8 +12,8 @@ leave the prism's faces by their cosine are spread as its outline is wide, and s
 surface.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from ddprt.scene.mesh import SIDES, Scene
 from ddprt.scene.tubes import CORNER, ring_corners
 from ddprt.transport import fibre
 from ddprt.transport.embree import Tracer
+from ddprt.transport.far_fibre import FarFibre, FarVertices
 from ddprt.transport.walk import MAX_SURVIVAL, SURVIVAL, Vertices
 
 _NOT_ACROSS = 1e-6  # sine of the angle between ray and fibre below which any direction across will do
@@ -31,7 +32,7 @@ _NOT_ACROSS = 1e-6  # sine of the angle between ray and fibre below which any di
 
 @dataclass(frozen=True, eq=False)
 class FibreVertices:
-    """Where paths met strands, ready for any light.
+    """Where paths met strands, and what they go on from.
 
     Attributes:
       there: points on the axis (the normal is the direction across it towards the viewer) and receivers; the throughput is what
@@ -40,6 +41,7 @@ class FibreVertices:
       reach: of the prism from its axis, metres.
       held: see `fibre.prepared`.
       shape: see `fibre.shape_of`.
+      far: the same for lamps.
     """
 
     there: Vertices
@@ -47,50 +49,16 @@ class FibreVertices:
     reach: Float32[np.ndarray, " n"]
     held: Float32[np.ndarray, "n 23"]
     shape: Float64[np.ndarray, "6"]
+    far: FarVertices
 
     @classmethod
-    def joined(cls, parts: "Sequence[FibreVertices]") -> "FibreVertices":
-        """One list of many."""
-        frames, reach = np.concatenate([part.frames for part in parts]), np.concatenate([part.reach for part in parts])
-        held = np.concatenate([part.held for part in parts])
-        return cls(Vertices.joined([part.there for part in parts]), frames, reach, held, parts[0].shape)
-
-    @property
-    def place(self) -> Float32[np.ndarray, "6 n"]:
-        """Points on the axis and directions across it."""
-        return self.there.place
-
-    @property
-    def owner(self) -> Int32[np.ndarray, " n"]:
-        """The receivers."""
-        return self.there.owner
-
-    @property
-    def facing(self) -> None:
-        """Light from all sides counts."""
-
-    def blocks(self) -> "Iterator[FibreVertices]":
-        """Parts of about equal size that fit into a core's cache."""
-        first = 0
-        for there in self.there.blocks():
-            part = slice(first, first + len(there.owner))
-            yield FibreVertices(there, self.frames[part], self.reach[part], self.held[part], self.shape)
-            first = part.stop
-
-    def lit_from(self, directions: Float32[np.ndarray, "n 3"]) -> Vertices:
-        """What each W/m² that arrives from directions, on a plane that faces it, is worth to the receivers.
-
-        Shadow rays start outside of the prism; their normals are the directions themselves, which weigh nothing.
-        """
-        place, throughput = np.empty_like(self.there.place), np.empty_like(self.there.throughput)
-        local = np.empty((len(self.reach), 3), np.float32)
-        _leave(self.there.place, self.frames, self.reach, directions, local, place)
-        np.multiply(self.there.throughput, np.float32(np.pi) * fibre.phase(self.held, self.shape, local).T, out=throughput)
-        return replace(self.there, place=place, throughput=throughput)
+    def joined(cls, parts: "Sequence[FibreVertices]") -> FarVertices:
+        """What lamps see of many."""
+        return FarVertices.joined([part.far for part in parts])
 
     def scattered(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Origins and directions that light may come from, and phase over density."""
-        local, weight = fibre.sample(self.held, self.shape, rng.random((len(self.owner), 4), np.float32))
+        local, weight = fibre.sample(self.held, self.shape, rng.random((len(self.reach), 4), np.float32))
         directions = np.einsum("ni,nij->nj", local, self.frames).astype(np.float32)
         place, again = np.empty_like(self.there.place), np.empty_like(local)
         _leave(self.there.place, self.frames, self.reach, directions, again, place)
@@ -102,7 +70,7 @@ class FibreVertices:
         throughput = self.there.throughput * weight.T
         survival = np.minimum(np.float32(SURVIVAL) * throughput.max(0), np.float32(MAX_SURVIVAL))
         kept = np.flatnonzero(rng.random(len(survival), np.float32) < survival)
-        return origins[kept], directions[kept], throughput[:, kept] / survival[kept], self.owner[kept]
+        return origins[kept], directions[kept], throughput[:, kept] / survival[kept], self.there.owner[kept]
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,6 +86,7 @@ class Hair:
       absorption: optical depth of a radius, for each strand and channel.
       material: how they scatter.
       gains: see `fibre.gains`.
+      far: tables of the phase averaged over offsets.
     """
 
     tracer: Tracer
@@ -128,6 +97,7 @@ class Hair:
     absorption: Float64[np.ndarray, "strands 3"]
     material: Fibre
     gains: Float64[np.ndarray, "clarities angles"]
+    far: FarFibre
 
     @classmethod
     def of(cls, tracer: Tracer, scene: Scene) -> "Hair":
@@ -146,7 +116,8 @@ class Hair:
         reach = (CORNER * tubes.radius).ravel().astype(np.float32) + tracer.offset
         first = len(scene.triangles) - tubes.triangles
         rows = np.ascontiguousarray(rings.reshape(-1, 1 + SIDES, 3), np.float32)
-        return cls(tracer, first, tubes.pieces, rows, reach, absorption, material, fibre.gains(material))
+        tables = fibre.gains(material), FarFibre.of(material)
+        return cls(tracer, first, tubes.pieces, rows, reach, absorption, material, *tables)
 
     def seen(
         self,
@@ -164,9 +135,12 @@ class Hair:
           throughput, owner: see `FibreVertices`.
         """
         look = self._look(triangle, place, directions)
-        held = fibre.prepared(look.sine, look.offset, self.absorption[look.strand], self.material)
+        absorption = self.absorption[look.strand]
+        held = fibre.prepared(look.sine, look.offset, absorption, self.material)
+        rows = self.far.rows(look.sine, absorption, (look.offset + 1) / 2)
         there = Vertices(look.rows, throughput, owner)
-        return FibreVertices(there, look.frames, look.reach, held, fibre.shape_of(self.material))
+        far = self.far.seen(there, look.frames, look.reach, held, rows)
+        return FibreVertices(there, look.frames, look.reach, held, fibre.shape_of(self.material), far)
 
     def _look(
         self,
