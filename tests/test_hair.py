@@ -17,6 +17,7 @@ from ddprt.scene.material import Emission, Gloss, Material
 from ddprt.scene.mesh import Scene
 from ddprt.scene.tubes import TEXELS, bald, with_strands
 from ddprt.transport import fibre
+from ddprt.transport.along_strands import borrowing
 from ddprt.transport.effects import force, plan
 from ddprt.transport.embree import Tracer
 from ddprt.transport.gather import Receivers
@@ -132,12 +133,35 @@ def test_roulette_keeps_the_mean(fur: Scene) -> None:
     rng = np.random.default_rng(0)
     triangle = rng.integers(strands.first, len(fur.triangles), count).astype(np.int32)
     place, towards = tracer.corners[triangle].mean(1), tracer.normals[triangle]
-    there = strands.seen(triangle, place, towards, np.full((3, count), 0.2, np.float32), np.arange(count, dtype=np.int32))
+    there = strands.seen(
+        triangle,
+        place,
+        towards,
+        np.full((3, count), 0.2, np.float32),
+        np.arange(count, dtype=np.int32),
+        np.ones(count, np.float32),
+    )
     origins, directions, throughput, owner = there.go_on(rng)
     assert len(origins) == len(directions) == len(owner) == throughput.shape[1]
     # Binomial: 0.87 % of the sum.
     assert throughput[0].sum() == pytest.approx(0.2 * count, rel=4 * 0.0087)
     assert len(owner) == pytest.approx(0.4 * count, rel=4 * 0.0087)
+
+
+def test_who_is_close_is_told_by_the_distance_across(fur: Scene) -> None:
+    """Eight reaches, measured across the fibre."""
+    tracer, count = Tracer.of(fur, 1), 500
+    strands = Hair.of(tracer, fur)
+    rng = np.random.default_rng(0)
+    triangle = rng.integers(strands.first, len(fur.triangles), count).astype(np.int32)
+    towards = rng.normal(size=(count, 3)).astype(np.float32)
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    distance = rng.uniform(0, 0.1, count).astype(np.float32)
+    ones, owner = np.ones((3, count), np.float32), np.arange(count, dtype=np.int32)
+    there = strands.seen(triangle, tracer.corners[triangle].mean(1), towards, ones, owner, distance)
+    along = np.einsum("nd,nd->n", there.frames[:, 0], towards)
+    np.testing.assert_array_equal(there.far.close, distance * np.sqrt(1 - along**2) < 8 * there.reach)
+    assert 0.1 < there.far.close.mean() < 0.9
 
 
 def test_the_plan_names_strands_and_off_makes_them_diffuse(fur: Scene, cornell: Scene) -> None:
@@ -180,6 +204,20 @@ def test_a_bake_keeps_what_leaves_fibres(fur: Scene, tmp_path: Path) -> None:
     diffuse = ddprt.bake(force(fur, off=["hair"]), config=job())
     assert "exitant" not in diffuse.description
     assert diffuse.description["transport"]["integrator"] == "operator"
+
+
+def test_strands_borrow_where_nothing_is_scored_on(fur: Scene) -> None:
+    shared, own = ddprt.bake(fur, config=job()), ddprt.bake(fur, config=job(transport={"footprint": 0.0}))
+    fibres = (own.gbuffer["albedo"] == 1).all(1)
+    first, other = shared.maps("indirect", range(5)), own.maps("indirect", range(5))
+    for indices in (shared.split("train"), shared.split("validation")):
+        np.testing.assert_array_equal(first[indices][:, ~fibres], other[indices][:, ~fibres])
+        weights = borrowing(0.05, 8)
+        expected = weights @ other[indices][:, fibres].reshape(len(indices), 60, TEXELS, 3)
+        np.testing.assert_allclose(
+            first[indices][:, fibres], np.maximum(expected, 0).reshape(len(indices), -1, 3), rtol=2e-3, atol=1e-3 * other.max()
+        )
+    np.testing.assert_array_equal(first[shared.split("test")], other[own.split("test")])
 
 
 @pytest.mark.parametrize(

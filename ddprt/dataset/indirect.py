@@ -26,6 +26,7 @@ from ddprt.transport.effects import Plan
 from ddprt.transport.embree import Tracer
 from ddprt.transport.footprint import Footprints
 from ddprt.transport.glossiness import glossy
+from ddprt.transport.hairiness import borrowed_along
 from ddprt.transport.sources import Sent, Shown
 from ddprt.transport.translucency import filled
 
@@ -336,8 +337,7 @@ class IndirectBake:
 
         config, halves, stream = self.config.transport, len(kinds), f"{split} paths"
         given = config.test_samples if split == "test" else config.samples
-        lightings = [self.dataset.lightings[index] for index in indices]
-        scene = self.tracer, self.scene, self.atlas, lightings
+        scene = self.tracer, self.scene, self.atlas, [self.dataset.lightings[index] for index in indices]
         shared: dict[str, Any] = {"seed": self.config.seed, "bounces": self.effects.bounces}
         if given == "auto":
             given, noise = choose_samples(*scene, target=config.target_noise, stream=stream, **shared)
@@ -357,7 +357,7 @@ class IndirectBake:
             address: dict[str, Any] = {"samples": samples, "stream": f"{stream} {half}", **shared}
             self._follow(scratch, trace_paths(*scene, scratch.maps, skip=scratch.done, **address), stage, paths)
             parts.append(scratch)
-        self._finish([part.maps for part in parts], indices, todo, kinds, lambda light: light)
+        self._finish([part.maps for part in parts], indices, todo, kinds, borrowed_along(self.scene, config.footprint, samples))
         for part in parts:
             part.remove()
 

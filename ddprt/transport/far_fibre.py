@@ -1,9 +1,12 @@
 """A fibre seen from so far that its width does not show: the phase of `ddprt.transport.fibre`, averaged over the offset h.
 
-Where a path meets a strand, h is as evenly spread as the strand is wide, and nothing else that a lamp's light there depends on
-knows it: shadow rays start from the axis. So the mean over h is what the lamp gives on average, and it is smoother than the
-phase of any one h. A lobe's longitudinal part knows no h; only what it leaves and where it turns do. Their mean is a table over
-the angle with the plane across the fibre, its absorption, and the turn about it:
+Where a path meets a strand from afar, h is as evenly spread as the strand is wide, and nothing else that a lamp's light there
+depends on knows it: shadow rays start from the axis. So the mean over h is what the lamp gives on average, and it is smoother
+than the phase of any one h. From nearby this is not so: rays from one place that pass a fibre on either side of its axis differ
+in direction by its width over the distance, and what it focuses changes by as much. Who is `close` keeps the offset of its ray.
+
+A lobe's longitudinal part knows no h; only what it leaves and where it turns do. Their mean is a table over the angle with the
+plane across the fibre, its absorption, and the turn about it:
 
     f(light, viewer) = sum over lobes p of M_p(theta_light, theta_viewer) AN_p(turn; theta_viewer, absorption),
     AN_p = mean over h of A_p(h) N(turn - Phi_p(h)).
@@ -20,7 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ddprt.axes import Float, Float32, Float64, Int32
+from ddprt.axes import Bool, Float, Float32, Float64, Int32
 from ddprt.compiled import compiled
 from ddprt.scene.material import Fibre
 from ddprt.transport import fibre
@@ -94,6 +97,8 @@ class FarFibre:
         reach: Float32[np.ndarray, " n"],
         held: Float32[np.ndarray, "n 23"],
         rows: Int32[np.ndarray, "n 3"],
+        shape: fibre.Shape,
+        close: Bool[np.ndarray, " n"],
     ) -> "FarVertices":
         """Vertices ready for lamps.
 
@@ -101,12 +106,14 @@ class FarFibre:
           there: points on the axis, and pi times what each W/(m² sr) that leaves towards the viewer is worth.
           frames: rows along the fibre, across it towards the viewer, and across both.
           reach: how far off the axis shadow rays start.
-          held: of any offset; see `fibre.prepared`.
+          held: see `fibre.prepared`.
           rows: see `rows`.
+          shape: see `fibre.shape_of`.
+          close: seen from so near that their own offset counts.
         """
         record = np.empty((len(reach), _RECORD), np.float32)
         _record(there.place, frames, reach, held, there.throughput, self.sharp, record)
-        return FarVertices(there, record, rows, self)
+        return FarVertices(there, record, rows, held, close, shape, self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,20 +123,25 @@ class FarVertices:
     Attributes:
       there: see `FarFibre.seen`; normals mean nothing.
       record: all that a light's weight needs of each but its rows, one after another in memory; see `_record`.
-      rows: see `FarFibre.rows`.
+      rows, held, close, shape: see `FarFibre.seen`.
       far: the tables.
     """
 
     there: Vertices
     record: Float32[np.ndarray, "n 32"]
     rows: Int32[np.ndarray, "n 3"]
+    held: Float32[np.ndarray, "n 23"]
+    close: Bool[np.ndarray, " n"]
+    shape: fibre.Shape
     far: FarFibre
 
     @classmethod
     def joined(cls, parts: "Sequence[FarVertices]") -> "FarVertices":
         """One list of many."""
         record, rows = np.concatenate([part.record for part in parts]), np.concatenate([part.rows for part in parts])
-        return cls(Vertices.joined([part.there for part in parts]), record, rows, parts[0].far)
+        held, close = np.concatenate([part.held for part in parts]), np.concatenate([part.close for part in parts])
+        there = Vertices.joined([part.there for part in parts])
+        return cls(there, record, rows, held, close, parts[0].shape, parts[0].far)
 
     @property
     def place(self) -> Float32[np.ndarray, "6 n"]:
@@ -150,7 +162,8 @@ class FarVertices:
         first = 0
         for there in self.there.blocks():
             part = slice(first, first + len(there.owner))
-            yield FarVertices(there, self.record[part], self.rows[part], self.far)
+            own = self.record[part], self.rows[part], self.held[part], self.close[part]
+            yield FarVertices(there, *own, self.shape, self.far)
             first = part.stop
 
     def lit_from(self, directions: Float32[np.ndarray, "n 3"]) -> Vertices:
@@ -160,6 +173,10 @@ class FarVertices:
         """
         place, throughput = np.empty_like(self.there.place), np.empty_like(self.there.throughput)
         _light(self.record, self.rows, directions, self.far.around, self.far.along, place, throughput)
+        close = np.flatnonzero(self.close)
+        if len(close):
+            local = np.einsum("nij,nj->ni", self.record[close, :9].reshape(-1, 3, 3), directions[close])
+            throughput[:, close] = (self.record[close, 29:] * fibre.phase(self.held[close], self.shape, local)).T
         return Vertices(place, throughput, self.there.owner)
 
 

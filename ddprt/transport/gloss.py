@@ -171,6 +171,7 @@ class Surfaces:
         directions: Float32[np.ndarray, "n 3"],
         throughput: Float32[np.ndarray, "3 n"],
         owner: Int32[np.ndarray, " n"],
+        _distance: Float32[np.ndarray, " n"] | None = None,  # of no use here; strands ask for it
     ) -> tuple[Int32[np.ndarray, " n"], GlossyVertices | None]:
         """Triangles that rays hit, -1 now where they are glossy, and the paths that met one of these from its front."""
         hit = np.flatnonzero(np.take(self.shiny, triangle, mode="wrap") & (triangle >= 0))

@@ -27,6 +27,7 @@ from ddprt.transport.embree import Tracer
 from ddprt.transport.far_fibre import FarFibre, FarVertices
 from ddprt.transport.walk import MAX_SURVIVAL, SURVIVAL, Vertices
 
+_FAR = 8.0  # reaches of a fibre, across it, from which its width hardly shows: see docs/effects.md
 _NOT_ACROSS = 1e-6  # sine of the angle between ray and fibre below which any direction across will do
 
 
@@ -126,6 +127,7 @@ class Hair:
         directions: Float32[np.ndarray, "n 3"],
         throughput: Float32[np.ndarray, "3 n"],
         owner: Int32[np.ndarray, " n"],
+        distance: Float32[np.ndarray, " n"],
     ) -> FibreVertices:
         """Strands that someone sees.
 
@@ -133,14 +135,17 @@ class Hair:
           triangle, place: of the prisms, and where on them.
           directions: unit, towards the viewer.
           throughput, owner: see `FibreVertices`.
+          distance: of the viewer, metres.
         """
         look = self._look(triangle, place, directions)
         absorption = self.absorption[look.strand]
         held = fibre.prepared(look.sine, look.offset, absorption, self.material)
         rows = self.far.rows(look.sine, absorption, (look.offset + 1) / 2)
         there = Vertices(look.rows, throughput, owner)
-        far = self.far.seen(there, look.frames, look.reach, held, rows)
-        return FibreVertices(there, look.frames, look.reach, held, fibre.shape_of(self.material), far)
+        shape, across = fibre.shape_of(self.material), np.sqrt(np.maximum(1 - look.sine * look.sine, 0))
+        close = distance * across < _FAR * look.reach
+        far = self.far.seen(there, look.frames, look.reach, held, rows, shape, close)
+        return FibreVertices(there, look.frames, look.reach, held, shape, far)
 
     def _look(
         self,
@@ -167,6 +172,7 @@ class Hair:
         directions: Float32[np.ndarray, "n 3"],
         throughput: Float32[np.ndarray, "3 n"],
         owner: Int32[np.ndarray, " n"],
+        distance: Float32[np.ndarray, " n"],
     ) -> tuple[Int32[np.ndarray, " n"], FibreVertices | None]:
         """Triangles that rays hit, -1 now where they are a strand's, and the paths that met one, from whatever side."""
         hit = np.flatnonzero(triangle >= self.first)
@@ -175,7 +181,7 @@ class Hair:
         others = triangle.copy()
         others[hit] = -1
         place = self.tracer.on_triangle(triangle[hit], u[hit], v[hit])
-        return others, self.seen(triangle[hit], place, -directions[hit], throughput[:, hit], owner[hit])
+        return others, self.seen(triangle[hit], place, -directions[hit], throughput[:, hit], owner[hit], distance[hit])
 
     def begun(
         self,

@@ -5,8 +5,11 @@ Judged from the scene alone: what simulates hair is `ddprt.transport.hair`, whic
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from importlib import import_module
 from typing import Any
+
+import numpy as np
 
 from ddprt.errors import UserError
 from ddprt.scene.material import Material
@@ -30,6 +33,14 @@ def diffuse(material: Material) -> Material:
 def strands_of(tracer: Tracer, scene: Scene) -> Any:
     """The `ddprt.transport.hair.Hair` of a scene; None, and nothing imported, where there is none."""
     return import_module("ddprt.transport.hair").Hair.of(tracer, scene) if hairy(scene) else None
+
+
+def borrowed_along(scene: Scene, share: float, paths: int) -> Callable[[np.ndarray], np.ndarray]:
+    """What texels of strands make of a map by borrowing along them (`ddprt.transport.along_strands`); without hair, nothing."""
+    if scene.tubes is None or not hairy(scene) or share == 0:
+        return lambda light: light
+    module = import_module("ddprt.transport.along_strands")
+    return partial(module.borrowed, strands=len(scene.tubes.axis), weights=module.borrowing(share, paths))
 
 
 def refuse_hairy(scene: Scene, what: str, remedy: str) -> None:

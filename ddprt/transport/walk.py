@@ -145,9 +145,9 @@ def walked(
     throughput = np.ones((3, len(owner)), np.float32) if throughput is None else throughput
     parts, shiny, met = list[Vertices](), list[Any](), None
     while True:
-        triangle, u, v, _ = tracer.first(origins, directions)
+        triangle, u, v, distance = tracer.first(origins, directions)
         if gloss:
-            triangle, met = gloss.met(triangle, u, v, directions, throughput, owner)
+            triangle, met = gloss.met(triangle, u, v, directions, throughput, owner, distance)
         place = np.empty((6, len(owner)), np.float32)
         hits = triangle, u, v, directions, albedo(triangle, u, v)
         count = _arrive(*hits, tracer.normals, tracer.corners, tracer.offset, place, throughput, owner)
