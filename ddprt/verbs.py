@@ -196,7 +196,7 @@ def relight(call: Call) -> None:
     """turn a lighting into an indirect lightmap: ddprt relight MODEL --lighting lights.json --out relit.exr"""
     import json
 
-    from ddprt.lights import load_lightings, parse_lighting
+    from ddprt.lights import load_lightings, parse_lighting, scene_lights
     from ddprt.methods.method import STATUSES
     from ddprt.runtime.model_file import load_model
     from ddprt.scene.exr import write_exr
@@ -218,6 +218,8 @@ def relight(call: Call) -> None:
             raise UserError(
                 f'--lighting: got text that is not JSON ({error}), expected [{{"type": "point", ...}}] or the like; mend it'
             ) from None
+    elif Path(source).suffix.lower() in (".glb", ".gltf"):
+        lightings = [scene_lights(source)]
     else:
         lightings = load_lightings(source)
     for index, lighting in enumerate(lightings):

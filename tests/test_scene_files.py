@@ -253,7 +253,7 @@ def spoil(writer: Writer, **entries: object) -> Writer:
         (lambda: spoil(one(), extensionsUsed=["KHR_draco_mesh_compression"]), "KHR_draco_mesh_compression.*without Draco"),
         (lambda: spoil(one(), extensionsRequired=["EXT_meshopt_compression"]), "EXT_meshopt_compression"),
         (lambda: spoil(one(), extensionsRequired=["XYZ_unheard_of"]), "required extension XYZ_unheard_of"),
-        (lambda: one(mode=5), "triangle strip or fan"),
+        (lambda: one(mode=7), "mode 7, expected 0 to 6"),
         (lambda: one(mode=1), "no triangles"),
         (lambda: spoil(one(), meshes=[]), "number 0 among meshes, expected one of the 0 there are; export it again"),
         (lambda: spoil(one(), scenes=[{"nodes": [7]}]), "number 7 among nodes, expected one of the 1 there are"),
