@@ -341,7 +341,10 @@ class _Reader:
                 raise self.file.fault(f"got image {source} as KTX2, which is not read; export textures as PNG")
             self.images[source, kind] = kind(data)
         except OSError as problem:
-            raise self.file.fault(f"got image {source} that cannot be read ({problem}); export textures as PNG") from problem
+            why = str(problem).partition("<")[0].strip()  # Pillow adds an address
+            raise self.file.fault(
+                f"got image {source} that cannot be read ({why}), expected PNG or JPEG; export it again"
+            ) from problem
         return self.images[source, kind]
 
 
@@ -360,4 +363,7 @@ def _placing(texture: Any) -> tuple[int, float, list[float], list[float]]:
     """Number of its texture coordinates, and how they are turned, scaled and moved."""
     change = (texture.extensions or {}).get("KHR_texture_transform", {})
     number = change.get("texCoord", texture.texCoord or 0)
-    return number, change.get("rotation", 0.0), change.get("scale", [1.0, 1.0]), change.get("offset", [0.0, 0.0])
+    scale, offset = (
+        [float(value) for value in change.get(key, default)] for key, default in (("scale", (1, 1)), ("offset", (0, 0)))
+    )
+    return number, float(change.get("rotation", 0.0)), scale, offset
