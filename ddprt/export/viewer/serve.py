@@ -18,7 +18,7 @@ def server(page: str, port: int) -> ThreadingHTTPServer:
     body = page.encode("utf-8")
 
     class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:  # noqa: N802
+        def do_GET(self) -> None:
             """The page; nothing else is here."""
             known = self.path.split("?")[0] == "/"
             self.send_response(200 if known else 404)

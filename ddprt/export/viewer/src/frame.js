@@ -11,6 +11,9 @@ import { Transfer } from "./transfer.js";
 
 const SHADOW = window.matchMedia("(pointer: coarse)").matches ? 512 : 1024;
 
+/** The error that is shown as white, in units of the reference's root mean square. */
+export const WHITE = 0.5;
+
 export class Frame {
   constructor(model, renderer) {
     this.model = model;
@@ -59,7 +62,7 @@ export class Frame {
       painted: state.albedo,
       stored: state.source === "reference",
       reference: lighting ? this.#reference(state.lighting) : this.composer.target.texture,
-      exposure: view === ERROR ? stops / lighting.rms : view === BASIS ? 1 : stops,
+      exposure: view === ERROR ? 1 / (WHITE * lighting.rms) : view === BASIS ? 1 : stops,
     });
   }
 

@@ -1,10 +1,11 @@
 // The panel: what is shown, the lamps, and how far to trust it.
+import { WHITE } from "./frame.js";
 import { KEYS } from "./keys.js";
 import { hue } from "./lamps.js";
 import { colour, unit } from "./measure.js";
 
 const number = (x, digits = 3) => Number(x.toPrecision(digits)).toString();
-const percent = (x) => `${number(100 * x, 2)} %`;
+const percent = (x) => `${number(100 * x, 2)}\u00a0%`;
 
 export class Panel {
   constructor(app, document) {
@@ -148,8 +149,8 @@ export class Panel {
     this.at("meter").value = score ?? 0;
     const lighting = this.app.model.stored[state.lighting];
     this.at("error-told").textContent = lighting
-      ? `relative error ${percent(lighting.error)}${lighting.omitted ? `; ${lighting.omitted} of its lamps are not drawn` : ""}` +
-        (state.source === "error" ? `; white: an error of ${number(lighting.rms * 2 ** -state.exposure)} W/m²` : "")
+      ? `relative error ${percent(lighting.error)} with all bases${lighting.omitted ? `; ${lighting.omitted} of its lamps are not drawn` : ""}` +
+        (state.source === "error" ? `; white: an error of ${number(WHITE * lighting.rms)} W/m²` : "")
       : "";
     const spent = milliseconds.measure + milliseconds.weigh;
     const frameTime = this.app.view.frameTime();
