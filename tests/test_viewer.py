@@ -37,6 +37,8 @@ window.addEventListener("error", (event) => window.faults.push(event.message));
 for (const name of ["error", "warn"]) console[name] = (...said) => window.faults.push(said.join(" "));</script>"""
 TYPES = {"f2": "<f2", "f4": "<f4", "f8": "<f8", "i4": "<i4", "u1": "u1"}
 
+PROBE = Path(__file__).parent / "viewer_probe.js"
+
 
 @pytest.fixture(scope="module")
 def data(cornell: Scene) -> Dataset:
@@ -203,6 +205,38 @@ LAMPS["touching the ceiling"] = [{"type": "point", "position": [0.3, 0.547, 0.3]
 BAD_LINKS = ["#%7B", "#[1", "#5", '#{"show":"all"}', '#{"lamps":[{"type":"point"}]}', '#{"eye":[0,0,null]}', '#{"x":1}']
 
 
+def browsed(whole: str, question: dict[str, Any], probe: str, folder: Path) -> dict[str, Any]:
+    """What a probe finds in a page."""
+    if BROWSER is None:
+        pytest.skip("needs chromium or google-chrome on the path")
+    text = json.dumps(question).replace("<", "\\u003c")
+    added = f'<script type="application/json" id="asked">{text}</script><script>{probe}</script></body>'
+    whole = whole.replace("<body>", f"<body>{FAULTS}", 1)
+    at = whole.rindex("</body>")
+    made = folder / "page.html"
+    made.write_text(whole[:at] + added + whole[at + len("</body>") :], "utf-8")
+    command = [BROWSER, *FLAGS, f"--user-data-dir={folder / 'profile'}", made.as_uri()]
+    dumped = subprocess.run(command, capture_output=True, text=True, check=True, timeout=200).stdout
+    answer = re.search(r'<p id="probe">(.*?)</p>', dumped)
+    assert answer, "the page did not come to an end"
+    return json.loads(html.unescape(answer[1]))
+
+
+def test_page_opens_from_disk_and_lights_as_predict_does(model: Model, data: Dataset, tmp_path: Path) -> None:
+    probe = """const frame = window.ddprt.frame, lamps = JSON.parse(document.getElementById("asked").textContent).lamps;
+    const node = document.createElement("p"), map = Array.from(frame.composer.read());
+    node.id = "probe";
+    node.textContent = JSON.stringify({ faults, map, measured: Array.from(frame.measuring.measure(lamps)) });
+    document.body.append(node);"""
+    found = browsed(page(pack(model, data, stitch=False)), {"lamps": LAMPS["all"]}, probe, tmp_path)
+    assert found["faults"] == []
+    (values,) = data.values(data.split("test")[:1], model.points, model.quantity)
+    got, expected = np.reshape(found["map"], (*model.covered.shape, 4))[model.covered][:, :3], model.predict(values)
+    assert np.abs(got - expected).max() < 2e-3 * expected.max()
+    measured = model.measure(LAMPS["all"])
+    np.testing.assert_allclose(np.reshape(found["measured"], (-1, 3)), measured, rtol=2e-4, atol=2e-5 * measured.max())
+
+
 @dataclass(frozen=True)
 class Asked:
     """What the browser is asked about, and what it answers."""
@@ -217,8 +251,6 @@ class Asked:
 
 @pytest.fixture(scope="module")
 def asked(model: Model, data: Dataset, statue: Scene, tmp_path_factory: pytest.TempPathFactory) -> Asked:
-    if BROWSER is None:
-        pytest.skip("needs chromium or google-chrome on the path")
     folder, rng = tmp_path_factory.mktemp("viewer"), np.random.default_rng(0)
     models = [ddprt.fit(data, bases=6, **options) for options in OPTIONS]
     test = data.split("test")[:2]
@@ -240,25 +272,17 @@ def asked(model: Model, data: Dataset, statue: Scene, tmp_path_factory: pytest.T
         "bad_links": BAD_LINKS,
         "drawn": {"lamps": LAMPS["all"]},
     }
-    text = json.dumps(question).replace("<", "\\u003c")
-    probe = (Path(__file__).parent / "viewer_probe.js").read_text("utf-8")
-    added = f'<script type="application/json" id="asked">{text}</script><script>{probe}</script></body>'
-    whole = page(pack(model, data)).replace("<body>", f"<body>{FAULTS}")
-    at = whole.rindex("</body>")
-    made = folder / "page.html"
-    made.write_text(whole[:at] + added + whole[at + len("</body>") :], "utf-8")
-    command = [BROWSER, *FLAGS, f"--user-data-dir={folder / 'profile'}", made.as_uri()]
-    dumped = subprocess.run(command, capture_output=True, text=True, check=True, timeout=200).stdout
-    answer = re.search(r'<p id="probe">(.*?)</p>', dumped)
-    assert answer, "the page did not come to an end"
-    return Asked(models, np.array(values), measuring, rays, statue, json.loads(html.unescape(answer[1])))
+    found = browsed(page(pack(model, data)), question, PROBE.read_text("utf-8"), folder)
+    return Asked(models, np.array(values), measuring, rays, statue, found)
 
 
+@pytest.mark.slow
 def test_page_has_no_faults(asked: Asked) -> None:
     assert asked.found["faults"] == []
     assert asked.found["wide"] == 0, "nothing sticks out"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", range(len(OPTIONS)), ids=lambda index: str(OPTIONS[index]))
 def test_composed_lightmaps_are_those_of_predict(index: int, asked: Asked) -> None:
     model, found = asked.models[index], asked.found["models"][index]
@@ -272,6 +296,7 @@ def test_composed_lightmaps_are_those_of_predict(index: int, asked: Asked) -> No
         assert told["extrapolating"] == bool(trust.extrapolating)
 
 
+@pytest.mark.slow
 def test_fewer_bases_are_the_first_ones(asked: Asked) -> None:
     model = asked.models[0]
     weights, textures = model.coefficients(asked.values[0][0].astype(np.float32)), model.textures
@@ -280,6 +305,7 @@ def test_fewer_bases_are_the_first_ones(asked: Asked) -> None:
     assert np.abs(got - expected).max() < 2e-3 * expected.max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LAMPS)
 def test_measured_light_is_that_of_measure(name: str, asked: Asked) -> None:
     for model, found in zip(asked.measuring, asked.found["measured"], strict=True):
@@ -289,6 +315,7 @@ def test_measured_light_is_that_of_measure(name: str, asked: Asked) -> None:
         np.testing.assert_allclose(got, expected, rtol=2e-4, atol=2e-5 * expected.max())
 
 
+@pytest.mark.slow
 def test_shadow_rays_are_those_of_embree(asked: Asked) -> None:
     tracer = Tracer(asked.statue.corners)
     origins, directions, reach = (np.ascontiguousarray(part, np.float32) for part in np.split(asked.rays, [3, 6], 1))
@@ -297,6 +324,7 @@ def test_shadow_rays_are_those_of_embree(asked: Asked) -> None:
     assert (np.array(asked.found["occluded"], bool) == expected).mean() > 0.99  # edges of float32 and float64
 
 
+@pytest.mark.slow
 def test_what_a_user_does_shows(asked: Asked) -> None:
     found = asked.found
     for change in ("error", "reference", "moved", "reset"):
@@ -306,6 +334,7 @@ def test_what_a_user_does_shows(asked: Asked) -> None:
     assert found["dark"] < 40, "without lamps there is the background alone"
 
 
+@pytest.mark.slow
 def test_links_restore_the_state(asked: Asked) -> None:
     assert asked.found["link_differs"] == 0
     assert asked.found["link_same"]
@@ -313,6 +342,7 @@ def test_links_restore_the_state(asked: Asked) -> None:
     assert asked.found["said"].startswith("link: got one that cannot be followed")
 
 
+@pytest.mark.slow
 def test_keys_do_what_the_panel_does(asked: Asked) -> None:
     found = asked.found
     assert (found["key 2"], found["key b"], found["key ]"]) == ("direct", "basis", 1.75)
@@ -321,6 +351,7 @@ def test_keys_do_what_the_panel_does(asked: Asked) -> None:
     assert found["error_refused"] == "basis", "there is no error without a held-out lighting"
 
 
+@pytest.mark.slow
 def test_direct_light_on_the_screen_is_right(asked: Asked, cornell: Scene) -> None:
     """Radiance, camera, shadow maps, albedo and tone map against rays, but for pixels at edges of objects and shadows."""
     drawn = asked.found["drawn"]
