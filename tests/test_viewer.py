@@ -258,7 +258,8 @@ def asked(model: Model, data: Dataset, statue: Scene, tmp_path_factory: pytest.T
         replace(one, samples=replace(one.samples, depth=depth)) for one in (models[0], models[-1]) for depth in (0.0, 0.07)
     ]
     values = [data.values(test, one.points, one.quantity) for one in models]
-    origins, towards = np.array([[3.0], [0.7]])[..., None] * statue.radius * rng.uniform(-1, 1, (2, 300, 3))
+    origins = 3 * statue.radius * rng.uniform(-1, 1, (300, 3))
+    towards = rng.permutation(statue.corners.mean(1) - statue.centre)[:300]  # hardly any of them on the ground
     directions = towards - origins
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     rays = np.column_stack([origins, directions, rng.uniform(0.5, 8, 300) * statue.radius])
