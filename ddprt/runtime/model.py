@@ -22,6 +22,7 @@ from ddprt.methods.method import AsksForLights, Frame, Relighter
 from ddprt.runtime.coefficients import Coefficients
 from ddprt.runtime.trust import Trust, Yardstick
 from ddprt.sampling.points import Samples
+from ddprt.scene.fog import Fog
 from ddprt.scene.holes import Holes
 
 _LARGEST = float(np.finfo(np.float32).max)
@@ -50,6 +51,7 @@ class Model:
       constant: irradiance of emissive surfaces, which no light changes, W/m²; None where nothing glows.
       exitant: covered texels whose light is all that leaves them, to which no diffuse reflection of lamps comes; None where
         there are none.
+      fog: what fills the bounding box of the occluders; None for clear air.
     """
 
     method: str
@@ -68,6 +70,7 @@ class Model:
     holes: Holes | None = None
     constant: np.ndarray | None = None
     exitant: np.ndarray | None = None
+    fog: Fog | None = None
 
     def predict(
         self,
@@ -265,7 +268,7 @@ class Model:
     def _tracer(self) -> Any:
         from ddprt.transport.embree import Tracer
 
-        return Tracer(self.occluders, holes=self.holes)
+        return Tracer(self.occluders, holes=self.holes, fog=self.fog)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from ddprt.axes import Float, Float32, Float64, Int, Int32
+from ddprt.scene.fog import Fog
 from ddprt.scene.material import Material, bilinear
 
 SIDES = 3
@@ -59,6 +60,7 @@ class Scene:
       forced: effects that a user wants simulated whatever the materials say.
       refused: effects that a user wants left out likewise.
       tubes: strands, of which the last triangles are; None where there are none.
+      fog: what fills the bounding box; None for clear air.
     """
 
     name: str
@@ -73,6 +75,7 @@ class Scene:
     forced: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
     tubes: Tubes | None = None
+    fog: Fog | None = None
 
     @cached_property
     def corners(self) -> Float64[np.ndarray, "triangles 3 3"]:
@@ -111,7 +114,7 @@ class Scene:
 
     @cached_property
     def digest(self) -> str:
-        """Hash of geometry and materials: equal digests bake equal light."""
+        """Hash of geometry, materials and fog: equal digests bake equal light."""
         state = hashlib.sha256()
         arrays = [self.positions, self.triangles, self.normals, self.material, self.uv]
         for array in [*arrays, *(material.texture for material in self.materials)]:
@@ -128,6 +131,7 @@ class Scene:
         state.update(repr(self.forced).encode() if self.forced else b"")
         if self.tubes is not None:
             state.update(f"{self.tubes.axis.shape}".encode() + self.tubes.radius.tobytes() + self.tubes.colour.tobytes())
+        state.update(f"{self.fog}".encode() if self.fog else b"")
         return state.hexdigest()[:16]
 
     @cached_property

@@ -118,7 +118,7 @@ class Suspects:
 
 def measured(model: Model, lightings: list[Lighting]) -> Float32[np.ndarray, "lightings points 3"]:
     """What a model's points measure, W/m²: the bits of `Model.measure`, for which samples look for their points each time."""
-    tracer, samples = Tracer(model.occluders, holes=model.holes), model.samples
+    tracer, samples = Tracer(model.occluders, holes=model.holes, fog=model.fog), model.samples
 
     def work(lighting: Lighting) -> Float32[np.ndarray, "samples 3"]:
         return measure(tracer, lighting, samples.position, samples.normal, seed=0, depth=samples.depth)
