@@ -1,5 +1,6 @@
 """Fog: transmittance, its samplers, single scattering by quadrature, furnaces, two integrators, plans, bakes and refusals."""
 
+import sys
 import tomllib
 from dataclasses import replace
 from itertools import pairwise
@@ -8,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.integrate import dblquad, quad
+from scipy.integrate import quad
 from scipy.stats import chi2
 
 import ddprt
@@ -36,6 +37,10 @@ from ddprt.transport.paths import trace_paths
 from ddprt.transport.reference import on_points, on_texels, trace_reference
 from ddprt.transport.shading import shade, shift
 from ddprt.transport.walk import albedo_of, walked
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
+
+from effect_figures import scattered_once
 
 LAMP: dict[str, Any] = {"type": "point", "position": [0.3, 0.4, 0.2], "intensity": [1, 1, 1]}
 SUN: dict[str, Any] = {"type": "directional", "direction": [0.2, -0.3, 1], "irradiance": [1, 1, 1]}
@@ -191,23 +196,6 @@ def test_places_on_a_stretch_are_drawn_by_the_density_they_weigh_by(lamp: tuple[
 # --- closed forms --------------------------------------------------------------------------------------------------------
 
 
-def scattered_once(height: float, free: float, albedo: float, g: float) -> float:
-    """Irradiance of a place that faces a lamp of 1 W/sr, by fog without an end that scatters once.
-
-    Along each ray in the angle that the lamp sees it under, so that its singularity is gone.
-    """
-
-    def part(angle: float, theta: float) -> float:
-        foot, beside = height * np.cos(theta), height * np.sin(theta)
-        along, far = foot + beside * np.tan(angle), beside / np.cos(angle)
-        cosine = -np.sin(angle)  # between the ray and the way from there to the lamp
-        phase = (1 - g * g) / (4 * np.pi * (1 + g * g - 2 * g * cosine) ** 1.5)
-        return float(2 * np.pi * np.cos(theta) * np.sin(theta) / beside * albedo / free * np.exp(-(along + far) / free) * phase)
-
-    ends = lambda theta: theta - np.pi / 2  # noqa: E731  # where the ray begins
-    return float(dblquad(part, 1e-9, np.pi / 2, ends, lambda _: np.pi / 2 - 1e-9, epsabs=1e-7)[0])
-
-
 @pytest.mark.parametrize("g", [0.0, 0.6])
 def test_light_that_scatters_once_is_that_of_quadrature(g: float) -> None:
     """A lamp half a metre over the floor of a black room whose walls are ten free paths away; both integrators."""
@@ -239,7 +227,12 @@ def test_light_that_scatters_once_is_that_of_quadrature(g: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("paths", "g"), [((2.0, 2.0, 2.0), 0.0), ((0.5, 0.5, 0.5), 0.7), ((4.0, 1.0, 0.25), 0.3)], ids=["thin", "forwards", "apart"]
+    ("paths", "g"),
+    [
+        pytest.param((4.0, 1.0, 0.25), 0.3, id="apart"),
+        pytest.param((2.0, 2.0, 2.0), 0.0, id="thin", marks=pytest.mark.slow),
+        pytest.param((0.5, 0.5, 0.5), 0.7, id="forwards", marks=pytest.mark.slow),
+    ],
 )
 def test_white_fog_in_a_closed_room_keeps_the_energy(furnace: Scene, furnace_atlas: Atlas, paths: Any, g: float) -> None:
     """What walls absorb is what the lamp sends out, wherever fog sends it before: the mean of (1 - a) E is flux over area."""
@@ -425,12 +418,19 @@ def test_others_are_refused_beside_fog_too(room: Scene) -> None:
 # --- bakes ---------------------------------------------------------------------------------------------------------------
 
 
-def test_a_bake_keeps_its_fog_through_fit_save_and_load(room: Scene, cornell: Scene, tmp_path: Path) -> None:
+def test_a_bake_keeps_its_fog(room: Scene, tmp_path: Path) -> None:
     data = ddprt.bake(room, config=job(), out=tmp_path / "a")
     assert data.description["transport"]["integrator"] == "paths"
-    assert data.fog == room.fog
-    assert ddprt.open_dataset(tmp_path / "a").fog == room.fog
-    model = ddprt.fit(data, method="mean")
+    assert ddprt.open_dataset(tmp_path / "a").fog == data.fog == room.fog
+    there = ddprt.bake(room, config=job(), out=tmp_path / "a")  # all is there
+    np.testing.assert_array_equal(there.maps("indirect", range(5)), data.maps("indirect", range(5)))
+    with pytest.raises(UserError, match="holds another dataset"):
+        ddprt.bake(force(room, off=["fog"]), config=job(), out=tmp_path / "a")
+
+
+@pytest.mark.slow  # for the time that JAX takes to begin
+def test_a_model_keeps_its_fog_through_save_and_load(room: Scene, tmp_path: Path) -> None:
+    model = ddprt.fit(ddprt.bake(room, config=job()), method="mean")
     model.save(tmp_path / "model")
     back = ddprt.load_model(tmp_path / "model")
     assert back.fog == model.fog == room.fog
@@ -439,10 +439,6 @@ def test_a_bake_keeps_its_fog_through_fit_save_and_load(room: Scene, cornell: Sc
     clear = replace(model, fog=None).measure(LAMP)
     lit = clear[:, 0] > 0
     assert (model.measure(LAMP)[lit] < 0.95 * clear[lit]).all()
-    there = ddprt.bake(room, config=job(), out=tmp_path / "a")  # all is there
-    np.testing.assert_array_equal(there.maps("indirect", range(5)), data.maps("indirect", range(5)))
-    with pytest.raises(UserError, match="holds another dataset"):
-        ddprt.bake(force(room, off=["fog"]), config=job(), out=tmp_path / "a")
 
 
 def test_fog_forced_off_gives_the_bits_of_clear_air(room: Scene, cornell: Scene, tmp_path: Path) -> None:

@@ -293,8 +293,8 @@ def _scatter(directions: np.ndarray, numbers: np.ndarray, g: float, out: np.ndar
     for i in range(len(directions)):
         u, turn = np.float64(numbers[i, 0]), 2 * np.pi * numbers[i, 1]
         part = (1 - g * g) / (1 - g + 2 * g * u)
-        cosine = 2 * u - 1 if abs(g) < 1e-6 else (1 + g * g - part * part) / (2 * g)
-        cosine = min(max(cosine, -1.0), 1.0)
+        drawn = 2 * u - 1 if abs(g) < 1e-6 else (1 + g * g - part * part) / (2 * g)
+        cosine = min(max(drawn, -1.0), 1.0)
         x, y, z = np.float64(directions[i, 0]), np.float64(directions[i, 1]), np.float64(directions[i, 2])
         sign = 1.0 if z >= 0 else -1.0
         a = -1 / (sign + z)
