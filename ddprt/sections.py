@@ -23,11 +23,36 @@ class Section(BaseModel):
         return str(value).lower() if isinstance(value, bool) else value
 
 
+class FogConfig(Section):
+    """A homogeneous medium that fills the scene's bounding box; see `ddprt.scene.fog`."""
+
+    mean_free_path: tuple[float, ...] = Field((), description="metres per channel, or one number for all; none: no fog")
+    albedo: tuple[float, ...] = Field((1.0,), description="of single scattering, 0 to 1, likewise")
+    anisotropy: float = Field(0.0, description="mean cosine of the angle of scattering, -1 to 1, both excluded")
+
+    @field_validator("mean_free_path", "albedo", mode="before")
+    @classmethod
+    def _of_all_channels(cls, value: Any) -> Any:
+        return [value] if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> "FogConfig":
+        if not self.mean_free_path and self != FogConfig.model_construct():
+            raise ValueError("mean_free_path: got none, expected metres, e.g. [0.5]; add it, or leave [scene.fog] out")
+        return self
+
+    @property
+    def given(self) -> dict[str, Any] | None:
+        """What `load_scene` takes; None for clear air."""
+        return self.model_dump() if self.mean_free_path else None
+
+
 class SceneConfig(Section):
     """What stays still."""
 
     name: str = Field("cornell", description="a name of SCENES, or a path to an .obj, .ply, .stl, .gltf or .glb file")
     parameters: dict[str, float] = Field({}, description="numbers that a scene in code takes, e.g. {albedo = 0.5}")
+    fog: FogConfig = FogConfig()
 
 
 class AtlasConfig(Section):

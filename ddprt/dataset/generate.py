@@ -34,6 +34,7 @@ from ddprt.sections import PointsConfig
 from ddprt.transport.direct import Texels
 from ddprt.transport.effects import Plan, plan
 from ddprt.transport.embree import Tracer
+from ddprt.transport.fogginess import refuse_beside_fog
 from ddprt.transport.glossiness import scattering
 from ddprt.transport.hairiness import refuse_beside
 from ddprt.transport.measure import measure
@@ -184,6 +185,7 @@ class _Bake:
             lightings = [lighting for _, lighting in entries]
         effects = plan(self.scene, lightings, bounces=self.config.transport.bounces, probes=self.config.probes.asked)
         refuse_beside(effects.called, self.config.transport.denoise)
+        refuse_beside_fog(effects.called)
         description = self._description(entries, effects, drawn, samples)
         bounces = next(effect for effect in effects.effects if effect.name == "diffuse bounces")
         operator = description["transport"]["integrator"] == "operator"  # which tells what it left out, if anything
@@ -226,6 +228,7 @@ class _Bake:
             **{key: value for key, value in baked_settings(self.config, self.scene).items() if value != []},
             "quantity": "irradiance",
             **({"exitant": exitant} if (exitant := self._exitant()) else {}),
+            **({"fog": self.scene.fog.record} if self.scene.fog else {}),
             "unit": "W/m2",
             "points": self._points(samples),
             "plan": [asdict(effect) for effect in effects.effects],

@@ -24,6 +24,7 @@ from ddprt.lights import Lighting, parse_lighting
 from ddprt.sampling.points import Samples
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.exr import exposure_for, read_exr, write_exr
+from ddprt.scene.fog import Fog
 from ddprt.scene.holes import Holes
 from ddprt.scene.mesh import Scene
 from ddprt.transport.translucency import exitant_texels
@@ -138,6 +139,16 @@ class Dataset:
             return Holes.read(tensors, len(tensors["corners"]))
         except ValueError as error:
             raise UserError(f"{path}: {error}; bake it again") from None
+
+    @cached_property
+    def fog(self) -> Fog | None:
+        """What light passes on its way; None for clear air.
+
+        Raises:
+          UserError: it is none that can be.
+        """
+        given = self.description.get("fog")
+        return None if given is None else Fog.of(given, f"{self.folder / 'dataset.json'}: fog")
 
     def maps(self, kind: str, indices: Sequence[int]) -> Float32[np.ndarray, "lightings texels 3"]:
         """Lightmaps of the covered texels in W/m²; kind is "direct", "indirect" or (held-out lightings) "noise"."""

@@ -22,6 +22,7 @@ from ddprt.methods.method import AsksForLights, Frame, Relighter
 from ddprt.runtime.coefficients import Coefficients
 from ddprt.runtime.trust import Trust, Yardstick
 from ddprt.sampling.points import Samples
+from ddprt.scene.fog import Fog
 from ddprt.scene.holes import Holes
 
 _LARGEST = float(np.finfo(np.float32).max)
@@ -52,6 +53,7 @@ class Model:
       exitant: covered texels whose light is all that leaves them, to which no diffuse reflection of lamps comes; None where
         there are none.
       albedo: of the covered texels, linear, to show them by; no answer depends on it. None in models of older versions.
+      fog: what fills the bounding box of the occluders; None for clear air.
     """
 
     method: str
@@ -71,6 +73,7 @@ class Model:
     constant: np.ndarray | None = None
     exitant: np.ndarray | None = None
     albedo: np.ndarray | None = None
+    fog: Fog | None = None
 
     def predict(
         self,
@@ -280,7 +283,7 @@ class Model:
     def _tracer(self) -> Any:
         from ddprt.transport.embree import Tracer
 
-        return Tracer(self.occluders, holes=self.holes)
+        return Tracer(self.occluders, holes=self.holes, fog=self.fog)
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,6 +24,7 @@ from ddprt.methods.method import FitReport
 from ddprt.runtime.model import LayerModel, Model
 from ddprt.runtime.trust import Yardstick
 from ddprt.sampling.points import Samples
+from ddprt.scene.fog import Fog
 from ddprt.scene.holes import Holes
 
 SCHEMA = 1
@@ -136,6 +137,7 @@ def save_model(model: Model, folder: Path) -> None:
         "relighter": static,
         "report": asdict(model.relighter.report),
         "trust": trust or None,
+        **({"fog": model.fog.record} if model.fog else {}),
         **({"layers": [_layer_entry(part.layer) for part in model.layers.values()]} if model.layers else {}),
         "unit": "W/m2",
         "tensors_sha256": sha256(folder / "tensors.safetensors"),
@@ -250,6 +252,7 @@ def _assemble(
         constant,
         exitant,
         paint,
+        None if document.get("fog") is None else Fog.of(document["fog"], "model.json: fog"),
     )
 
 

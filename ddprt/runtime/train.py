@@ -139,6 +139,7 @@ def fit_method(
         data.constant,
         None if isinstance(data, LayerData) else data.exitant,
         None if isinstance(data, LayerData) else data.gbuffer["albedo"],
+        None if isinstance(data, LayerData) else data.fog,
     )
 
 

@@ -1,9 +1,13 @@
 """`load_scene`: a name of the library or a file becomes a checked scene."""
 
 import re
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from ddprt.errors import UserError, nearest
+from ddprt.scene.fog import Fog
 from ddprt.scene.library import SCENES, build
 from ddprt.scene.mesh import Scene
 
@@ -21,16 +25,24 @@ EXPECTED = {
 SUFFIXES = tuple(EXPECTED)
 
 
-def load_scene(source: str | Path, **parameters: float | int) -> Scene:
+def load_scene(source: str | Path, *, fog: Fog | Mapping[str, Any] | None = None, **parameters: float | int) -> Scene:
     """A scene by its name in the library, or from a mesh file (metres, Y up).
 
     Args:
       source: a key of `SCENES`, or a path that ends in .glb, .gltf, .obj, .ply or .stl, or in .hair or .strands; a text
         with a separator or a suffix is a path, unless the library has it.
+      fog: what fills its bounding box, e.g. {"mean_free_path": 0.5, "albedo": 0.9, "anisotropy": 0.3}; None leaves the air as
+        the scene says.
       parameters: numbers that a scene of the library takes; of strands the `scale`, metres of a unit of the file.
     Raises:
-      UserError: no such scene, parameter, file or format, or a file that is damaged or fails a check.
+      UserError: no such scene, parameter, file or format, a file that is damaged or fails a check, or fog that cannot be.
     """
+    air = None if fog is None else Fog.of(fog, "scene.fog")
+    scene = _clear(source, parameters)
+    return replace(scene, fog=air) if air else scene
+
+
+def _clear(source: str | Path, parameters: dict[str, float | int]) -> Scene:
     path, name = Path(source), str(source)
     if isinstance(source, str) and name in SCENES:
         return build(name, **parameters)

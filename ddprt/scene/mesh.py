@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from ddprt.axes import Float, Float32, Float64, Int, Int32
+from ddprt.scene.fog import Fog
 from ddprt.scene.material import Material, bilinear
 
 SIDES = 3
@@ -61,6 +62,7 @@ class Scene:
       tubes: strands, of which the last triangles are; None where there are none.
       colour: linear factor on the albedo per vertex, 0 to 1, or None where it is 1 everywhere.
       lightmap: where the file would have each vertex on a lightmap, unchecked; see `ddprt.scene.own_charts`.
+      fog: what fills the bounding box; None for clear air.
     """
 
     name: str
@@ -77,6 +79,7 @@ class Scene:
     tubes: Tubes | None = None
     colour: Float64[np.ndarray, "vertices 3"] | None = None
     lightmap: Float64[np.ndarray, "vertices 2"] | None = None
+    fog: Fog | None = None
 
     @cached_property
     def corners(self) -> Float64[np.ndarray, "triangles 3 3"]:
@@ -115,7 +118,7 @@ class Scene:
 
     @cached_property
     def digest(self) -> str:
-        """Hash of geometry and materials: equal digests bake equal light."""
+        """Hash of geometry, materials and fog: equal digests bake equal light."""
         state = hashlib.sha256()
         arrays = [self.positions, self.triangles, self.normals, self.material, self.uv]
         for array in [*arrays, *(material.texture for material in self.materials)]:
@@ -135,6 +138,7 @@ class Scene:
         state.update(repr(self.forced).encode() if self.forced else b"")
         if self.tubes is not None:
             state.update(f"{self.tubes.axis.shape}".encode() + self.tubes.radius.tobytes() + self.tubes.colour.tobytes())
+        state.update(f"{self.fog}".encode() if self.fog else b"")
         return state.hexdigest()[:16]
 
     @cached_property

@@ -19,6 +19,7 @@ import numpy as np
 
 from ddprt.axes import Float32, Float64, Int32
 from ddprt.compiled import compiled
+from ddprt.lights import Light
 from ddprt.scene.material import Fibre
 from ddprt.scene.mesh import SIDES, Scene
 from ddprt.scene.tubes import CORNER, ring_corners
@@ -76,6 +77,10 @@ class FibreVertices:
             part = slice(first, first + len(there.owner))
             yield FibreVertices(there, self.frames[part], self.reach[part], self.held[part], self.shape)
             first = part.stop
+
+    def under(self, light: Light, start: Float32[np.ndarray, "3"]) -> "FibreVertices":
+        """Where the light of one lamp is asked for: here, whichever it is."""
+        return self
 
     def lit_from(self, directions: Float32[np.ndarray, "n 3"]) -> Vertices:
         """What each W/m² that arrives from directions, on a plane that faces it, is worth to the receivers.
