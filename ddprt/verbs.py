@@ -244,8 +244,11 @@ def export(call: Call) -> None:
     from ddprt.runtime.model_file import load_model
 
     job = call.run()
-    job.export(load_model(job.folder / "model.ddprt"))
+    model = load_model(job.folder / "model.ddprt")
+    job.export(model)
     print(f"textures: {job.folder / 'export'}")
+    if call.asks("table"):
+        print(f"{job.format_table(model)}\ntable:    {job.folder / 'export' / 'formats.json'}")
 
 
 def verify(call: Call) -> None:
@@ -323,7 +326,9 @@ VERBS = {
         {"lighting": "FILE|JSON  a list of lightings, or one as text", "out": "FILE.exr  where to (default: relit.exr)"},
         configured=False,
     ),
-    "export": Verb(export, options=_OUT),
+    "export": Verb(
+        export, options=_OUT, flags={"table": "   error against bytes of every format of textures (docs/export.md)"}
+    ),
     "verify": Verb(verify, "DIR", configured=False),
     "doctor": Verb(doctor, "", configured=False),
 }
