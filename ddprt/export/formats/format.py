@@ -77,7 +77,7 @@ class Format:
 
 def layered(
     values: Float32[np.ndarray, "maps height width channels"], per_layer: int
-) -> Float32[np.ndarray, "layers height width channels"]:
+) -> Float32[np.ndarray, "layers height width rgba"]:
     """Maps side by side in channels, `per_layer` of them where they have one channel; what is left over is 0."""
     count, height, width, channels = values.shape
     if channels > 1:
@@ -88,7 +88,7 @@ def layered(
 
 
 def unlayered(
-    layers: Float32[np.ndarray, "layers height width channels"], maps: Maps
+    layers: Float32[np.ndarray, "layers height width rgba"], maps: Maps
 ) -> Float32[np.ndarray, "maps height width channels"]:
     """The inverse: `maps` says how many there are, and of how many channels."""
     count, height, width, channels = maps.values.shape
