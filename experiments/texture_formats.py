@@ -3,7 +3,7 @@
 Question: what do 8 bits a channel or BC6H cost beside half and float, what does fitting the transfer to rounded textures gain,
           and which range should maps be moved to before BC6H?
 Command:  python experiments/texture_formats.py            configs/cornell.toml, minutes
-          python experiments/texture_formats.py --quick    at 128², 64 lightings to learn from, less than a minute
+          python experiments/texture_formats.py --quick    at 128², 64 lightings to learn from
 Answer:   docs/export.md, "Formats"
 
 BC6H needs `pip install "ddprt[textures]"`. The bake lies in runs/formats-SIDE. The last line is JSON: bytes and held-out
