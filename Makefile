@@ -36,7 +36,7 @@ $(READY): requirements.lock pyproject.toml
 
 # Needs uv; writes no addresses into the lock.
 lock:
-	uv pip compile pyproject.toml --extra test --extra reference --extra denoise --extra flip --extra dev --universal --python-version 3.11 --generate-hashes \
+	uv pip compile pyproject.toml --extra test --extra reference --extra denoise --extra flip --extra textures --extra dev --universal --python-version 3.11 --generate-hashes \
 	  --no-emit-index-url --no-emit-find-links --no-annotate --no-header --output-file requirements.lock
 
 # Needs Node 20 or later and npm; users need neither, for the bundle is committed. Built apart, so that no package is shipped.

@@ -60,6 +60,10 @@ class Run:
 
         check_names(self.config)
         self._check_views()
+        if self.config.export.formats != ("exr",) and self.config.fit.method == "svd-ridge":
+            from ddprt.export.formats.listing import check_formats
+
+            check_formats(self.config.export.formats, self.config.atlas.resolution, self.config.atlas.resolution)
 
     def _check_views(self) -> None:
         if self.config.report.views:
@@ -241,6 +245,21 @@ class Run:
         if self.config.export.stitch and not seams["stitched"]:
             self.progress.warn(f"export.stitch: seams stay open: {seams['why']}")
         return files
+
+    def format_table(self, model: Any) -> str:
+        """What every format of textures costs, on held-out lightings where the run has its dataset; also `formats.json`."""
+        from ddprt.export.table import HeldOut, as_json, format_table, told
+
+        held_out = None
+        if (self.folder / "dataset" / "dataset.json").is_file():
+            data = self.dataset()
+            test = data.split("test")
+            held_out = HeldOut(data.values(test, model.points, model.quantity), data.maps("indirect", test))
+        with self.progress.stage("format table"):
+            settings = self.config.export
+            rows = format_table(model, held_out, gutter=settings.gutter, stitch=settings.stitch, refit=settings.refit)
+        write_text(self.folder / "export" / "formats.json", as_json(rows))
+        return told(rows)
 
     def sweep(self) -> list[Path]:
         """Tries settings about the configuration (`ddprt bench`); returns the results and what shows them."""

@@ -278,6 +278,18 @@ class ExportConfig(Section):
     precision: Literal["half", "float"] = Field("half", description="of the basis textures")
     gutter: int = Field(4, ge=0, le=64, description="texels that charts are extended by, smoothly")
     stitch: bool = Field(True, description="make charts agree where a smooth surface was cut to be unwrapped")
+    formats: tuple[Literal["exr", "exr-grid", "raw", "ktx2", "bytes", "bc6h", "bc6h-ktx2"], ...] = Field(
+        ("exr",), min_length=1, description="files that basis textures are written to (docs/export.md)"
+    )
+    refit: bool = Field(True, description="fit the transfer to the textures as each format but exr holds them")
+
+    @field_validator("formats")
+    @classmethod
+    def _each_once(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice:
+            raise ValueError(f'got "{twice}" more than once, expected every format once; leave the others out')
+        return names
 
 
 class BenchConfig(Section):

@@ -246,8 +246,11 @@ def export(call: Call) -> None:
     from ddprt.runtime.model_file import load_model
 
     job = call.run()
-    job.export(load_model(job.folder / "model.ddprt"))
+    model = load_model(job.folder / "model.ddprt")
+    job.export(model)
     print(f"textures: {job.folder / 'export'}")
+    if call.asks("table"):
+        print(f"{job.format_table(model)}\ntable:    {job.folder / 'export' / 'formats.json'}")
 
 
 def view(call: Call) -> None:
@@ -350,7 +353,9 @@ VERBS = {
         {"lighting": "FILE|JSON  a list of lightings, or one as text", "out": "FILE.exr  where to (default: relit.exr)"},
         configured=False,
     ),
-    "export": Verb(export, options=_OUT),
+    "export": Verb(
+        export, options=_OUT, flags={"table": "   error against bytes of every format of textures (docs/export.md)"}
+    ),
     "view": Verb(
         view,
         "MODEL",
