@@ -42,7 +42,7 @@ class Model:
       covered: which texels of the lightmap carry light.
       area: of the covered texels, m².
       occluders: triangle corners that cast shadows, metres.
-      scene: name and digest of what it was trained on.
+      scene: name and digest of what it was trained on; "unmeasured" tells why it cannot measure lights by itself, if it cannot.
       uv: lightmap coordinates of the occluders' corners, origin top-left; None in models of older versions.
       yardstick: what trust is measured with; None likewise.
       layers: what answers for light besides the lightmap, by name of the layer.
@@ -168,9 +168,15 @@ class Model:
         return Trust(*(np.asarray(getattr(found, entry.name)[0]) for entry in fields(found))) if single else found
 
     def measure(self, lighting: Lighting | Light | Sequence[dict[str, Any]] | dict[str, Any]) -> np.ndarray:
-        """(points, 3) float32: direct light at the points with shadow rays, W/m², as `predict` takes it."""
+        """(points, 3) float32: direct light at the points with shadow rays, W/m², as `predict` takes it.
+
+        Raises:
+          UserError: no lighting, or a model of imported light that lacks what it would take.
+        """
         from ddprt.transport.measure import measure
 
+        if "unmeasured" in self.scene:
+            raise UserError(f"measure: got a lighting, but {self.scene['unmeasured']}")
         parsed = parse_lighting(lighting)
         samples = self.samples
         irradiance = measure(self._tracer, parsed, samples.position, samples.normal, seed=0, depth=samples.depth)

@@ -20,6 +20,11 @@ EXPECTED = {
 
 SUFFIXES = tuple(EXPECTED)
 
+IMPORTED = "imported"
+"""The `scene.name` of runs whose light comes from elsewhere."""
+
+_BEYOND = 1e-4  # of the unit square, that rounding may move coordinates out of it
+
 
 def load_scene(source: str | Path, **parameters: float | int) -> Scene:
     """A scene by its name in the library, or from a mesh file (metres, Y up).
@@ -35,6 +40,11 @@ def load_scene(source: str | Path, **parameters: float | int) -> Scene:
     if isinstance(source, str) and name in SCENES:
         return build(name, **parameters)
     suffix = path.suffix.lower()
+    if name == IMPORTED:
+        raise UserError(
+            f'scene.name: got "{IMPORTED}", expected a scene: this run holds light that was imported, which `ddprt fit`, `eval` '
+            "and `export` work on; what traces light needs a scene of its own"
+        )
     if suffix not in SUFFIXES and isinstance(source, str) and not path.suffix and not re.search(r"[/\\]", name):
         known = ", ".join(sorted(SCENES))
         raise UserError(
@@ -66,17 +76,43 @@ def load_scene(source: str | Path, **parameters: float | int) -> Scene:
         ) from problem
 
 
-def _read(path: Path, suffix: str) -> Scene:
+def load_lightmapped(path: Path) -> Scene:
+    """A mesh whose `uv` are those of its lightmap: TEXCOORD_1 (else TEXCOORD_0) of glTF, the texture coordinates of an OBJ.
+
+    Raises:
+      UserError: missing, damaged, of a format without such coordinates, or outside of the unit square.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in (".glb", ".gltf", ".obj"):
+        raise UserError(f'{path}: got suffix "{path.suffix}", expected .glb, .gltf or .obj, which have coordinates of lightmaps')
+    if not path.is_file():
+        raise UserError(f"{path}: got no such file, expected a mesh; check the path")
+    try:
+        scene = _read(path, suffix, lightmap=True)
+    except UserError:
+        raise
+    except Exception as problem:
+        raise UserError(f"{path.name}: got a damaged file, expected {EXPECTED[suffix]}; export it again") from problem
+    assert scene.uv is not None
+    used = scene.uv[scene.triangles]
+    if not (used >= -_BEYOND).all() or not (used <= 1 + _BEYOND).all() or not used.any():
+        raise UserError(
+            f"{path.name}: got lightmap coordinates from {used.min():.3g} to {used.max():.3g}, expected 0 to 1; unwrap it anew"
+        )
+    return scene
+
+
+def _read(path: Path, suffix: str, *, lightmap: bool = False) -> Scene:
     # Each reader brings its own library, which a scene in code should not wait for.
     if suffix in (".glb", ".gltf"):
         from ddprt.scene.gltf import load_gltf
 
-        return load_gltf(path)
+        return load_gltf(path, lightmap=lightmap)
     from ddprt.scene.polygons import load_polygons
 
     if suffix == ".obj":
         _check_corners(path)
-    return load_polygons(path)
+    return load_polygons(path, lightmap=lightmap)
 
 
 def _check_corners(path: Path) -> None:

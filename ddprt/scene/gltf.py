@@ -21,7 +21,7 @@ from ddprt.axes import Float, Float64, Int
 from ddprt.scene.accessors import Container, open_gltf
 from ddprt.scene.checks import UNSAID, checked
 from ddprt.scene.images import linear_image, plain_image
-from ddprt.scene.material import Cutout, Emission, Gloss, Material, Subsurface
+from ddprt.scene.material import Cutout, Emission, Gloss, Material, Subsurface, plain
 from ddprt.scene.mesh import Scene
 
 REFUSED = {
@@ -47,11 +47,13 @@ HARMLESS = ("KHR_materials_", "KHR_lights_", "KHR_xmp", "KHR_animation", "KHR_no
 """May be required by a file and are still only ignored."""
 
 
-def load_gltf(path: Path) -> Scene:
+def load_gltf(path: Path, *, lightmap: bool = False) -> Scene:
     """Read a glTF file's default scene into one mesh in world space.
 
     Args:
       path: a .glb, or a .gltf with its buffers and images embedded or beside it.
+      lightmap: take the coordinates of lightmaps, TEXCOORD_1 or else TEXCOORD_0, in place of those of textures; materials keep
+        their factors alone.
     Returns:
       The scene: metres, fronts as in the file (mirrored nodes keep theirs), one material per glTF material.
     Raises:
@@ -62,7 +64,7 @@ def load_gltf(path: Path) -> Scene:
     with warnings.catch_warnings():
         # pygltflib speaks by warnings; what matters in them is found and refused below.
         warnings.simplefilter("ignore")
-        return _Reader(open_gltf(path)).scene()
+        return _Reader(open_gltf(path), lightmap).scene()
 
 
 @dataclass
@@ -79,6 +81,7 @@ class _Part:
 @dataclass
 class _Reader:
     file: Container
+    lightmap: bool = False
     ignored: set[str] = field(default_factory=set)
     notes: list[str] = field(default_factory=list)
     images: dict[tuple[int, Any], np.ndarray] = field(default_factory=dict)
@@ -90,7 +93,7 @@ class _Reader:
             raise self.file.fault("got no triangles, expected a mesh in the file's scene; export at least one")
         starts = np.cumsum([0, *[len(part.positions) for part in parts]])
         numbers = sorted({part.material for part in parts})
-        materials = tuple(self._material(number) for number in numbers)
+        materials = tuple(plain(self._material(number)) if self.lightmap else self._material(number) for number in numbers)
         self.ignored.update(
             what for what, there in (("animations", self.file.json.animations), ("skins", self.file.json.skins)) if there
         )
@@ -102,7 +105,9 @@ class _Reader:
             normals=np.concatenate([part.normals for part in parts]),
             material=np.concatenate([np.full(len(part.triangles), numbers.index(part.material)) for part in parts]),
             materials=materials,
-            uv=np.concatenate([part.uv for part in parts]) if any(entry.textures for entry in materials) else None,
+            uv=np.concatenate([part.uv for part in parts])
+            if self.lightmap or any(entry.textures for entry in materials)
+            else None,
             notes=(*self.notes, *listed),
         )
 
@@ -187,6 +192,12 @@ class _Reader:
         )
 
     def _coordinates(self, primitive: Any, count: int) -> Float[np.ndarray, "vertices 2"]:
+        if self.lightmap:
+            given = [getattr(primitive.attributes, f"TEXCOORD_{number}", None) for number in (1, 0)]
+            found = next((accessor for accessor in given if accessor is not None), None)
+            if found is None:
+                raise self.file.fault("got no TEXCOORD_1, expected coordinates of the lightmap; unwrap it, and export them")
+            return self.file.accessor(found, 2)
         texture = None if primitive.material is None else _leading(self.file.entry("materials", primitive.material))
         if texture is None:
             return np.zeros((count, 2))
