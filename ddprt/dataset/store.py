@@ -342,9 +342,7 @@ def write_atlas(folder: Path, atlas: Atlas, manifest: Manifest) -> None:
         write_plane(folder, name, atlas.image(values), manifest)
 
 
-def write_plane(
-    folder: Path, name: str, image: Float32[np.ndarray, "height width *channels"], manifest: Manifest
-) -> None:
+def write_plane(folder: Path, name: str, image: Float32[np.ndarray, "height width *channels"], manifest: Manifest) -> None:
     """One picture of the G-buffer."""
     write_exr(folder / "atlas" / f"{name}.exr", image.reshape(*image.shape[:2], -1))
     manifest.add(f"atlas/{name}.exr")

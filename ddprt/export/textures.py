@@ -182,7 +182,7 @@ def _stitched(model: Model, images: list[np.ndarray], gutter: int, stitch: bool)
     if model.uv is None:
         return images, {
             "stitched": False,
-            "why": "a model of an older version, without lightmap coordinates; bake and fit again",
+            "why": "no lightmap coordinates: the light was imported without a mesh, or an older version baked it",
         }
     known = fill_gutter(model.covered[..., None].astype(np.float32), model.covered, gutter)[..., 0] > 0
     stitcher = Stitcher(find_seams(model.occluders, model.uv, known))

@@ -84,7 +84,9 @@ def load_lightmapped(path: Path) -> Scene:
     """
     suffix = path.suffix.lower()
     if suffix not in (".glb", ".gltf", ".obj"):
-        raise UserError(f'{path}: got suffix "{path.suffix}", expected .glb, .gltf or .obj, which have coordinates of lightmaps')
+        raise UserError(
+            f'{path}: got suffix "{path.suffix}", expected .glb, .gltf or .obj, which have coordinates of lightmaps'
+        )
     if not path.is_file():
         raise UserError(f"{path}: got no such file, expected a mesh; check the path")
     try:

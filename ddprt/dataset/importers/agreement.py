@@ -16,7 +16,11 @@ _LIKELY = {np.pi: "they look like E where E/pi was said", 1 / np.pi: "they look 
 
 
 def told(
-    places: Places, texel: np.ndarray, lightings: Sequence[Lighting], direct: Float32[np.ndarray, "lightings texels 3"]
+    places: Places,
+    texel: np.ndarray,
+    lightings: Sequence[Lighting],
+    direct: Float32[np.ndarray, "lightings texels 3"],
+    turned: Float32[np.ndarray, "lightings texels 3"],
 ) -> tuple[str, bool]:
     """How imported direct light compares with shadow rays of our own, and whether it agrees.
 
@@ -25,6 +29,7 @@ def told(
       texel: where it is compared.
       lightings: some.
       direct: their maps, W/m².
+      turned: the same of maps that are upside down.
     """
     tracer = Tracer(places.corners)
     position, normal = (getattr(places, name)[texel].astype(np.float64) for name in ("position", "normal"))
@@ -39,15 +44,11 @@ def told(
     for factor, why in _LIKELY.items():
         if abs(ratio / factor - 1) < _OFF and alike > _ALIKE:
             words += f"; {why}"
-    if alike <= _ALIKE and _correlation(_upside_down(places, texel, direct), traced) > max(alike, _ALIKE):
+    if alike <= _ALIKE and _correlation(turned[:, texel].astype(np.float64), traced) > max(alike, _ALIKE):
         words += "; they look upside down: row 0 of a map is its top"
     elif not fits and alike <= _ALIKE:
         words += "; look at the order of the lights, the axes (Y up) and the lightmap coordinates"
     return words, fits
-
-
-def _upside_down(places: Places, texel: np.ndarray, direct: np.ndarray) -> np.ndarray:
-    return np.stack([places.image(light)[::-1][places.covered][texel] for light in direct]).astype(np.float64)
 
 
 def _correlation(one: np.ndarray, other: np.ndarray) -> float:

@@ -39,7 +39,15 @@ SPACES: Catalogue[Space] = Catalogue(
     {
         "linear-rec709": Space(
             (*_REC709, *_D65),
-            names=("lin_rec709", "lin_rec709_scene", "linear", "scene_linear", "linear_rec_709", "linear_rec709", "rec709_linear")
+            names=(
+                "lin_rec709",
+                "lin_rec709_scene",
+                "linear",
+                "scene_linear",
+                "linear_rec_709",
+                "linear_rec709",
+                "rec709_linear",
+            )
             + ("linear_srgb", "lin_srgb", "non_color", "raw", "data"),
         ),
         "srgb": Space(

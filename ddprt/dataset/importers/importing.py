@@ -158,8 +158,11 @@ class _Import:
         other = "linear-rec709" not in picture.colour and "srgb" not in picture.colour
         return no_negatives(path, picture.light, clip=self.recipe.clip or other)
 
-    def _light(self, kind: str, path: Path, places: Places, quantity: Quantity) -> Float32[np.ndarray, "texels 3"]:
-        light = self._positive(path, read_picture(path, self._wanted(kind)))[places.covered]
+    def _light(
+        self, kind: str, path: Path, places: Places, quantity: Quantity, step: int = 1
+    ) -> Float32[np.ndarray, "texels 3"]:
+        """Light of the texels; `step` is -1 for that of the picture upside down."""
+        light = self._positive(path, read_picture(path, self._wanted(kind)))[::step][places.covered]
         found = irradiance(light, quantity, places.albedo)
         if not np.isfinite(found).all():
             raise UserError(f"{path}: got light past the range of float32, expected W/m²; make it dimmer")
@@ -188,7 +191,11 @@ class _Import:
         self, source: str, places: Places, samples: Samples, quantity: Quantity, why: str, *, meshed: bool
     ) -> dict[str, Any]:
         name = self.recipe.name or self.folder.resolve().name
-        lacks = ["noise", *(["direct"] if self.shots.direct is None else []), *([] if meshed and len(places.corners) else ["mesh"])]
+        lacks = [
+            "noise",
+            *(["direct"] if self.shots.direct is None else []),
+            *([] if meshed and len(places.corners) else ["mesh"]),
+        ]
         known = {"known": sorted(places.known), "lacks": lacks, "notes": list(self.notes)}
         kind = next(key for key, value in QUANTITIES.items() if value == quantity)
         return {
@@ -258,10 +265,11 @@ class _Import:
                 manifest.add(map_name("measured", index))
                 stage.advance()
         if kept and chosen is not None and len(places.corners) and all(self.shots.lightings):
-            self._agreed(places, chosen.texel, kept)
+            turned = [self._light("direct", path, places, quantity, -1) for path in (direct or ())[: len(kept)]]
+            self._agreed(places, chosen.texel, kept, turned)
 
-    def _agreed(self, places: Places, texel: np.ndarray, kept: Sequence[np.ndarray]) -> None:
-        words, fits = agreement.told(places, texel, self.shots.lightings[: len(kept)], np.stack(kept))
+    def _agreed(self, places: Places, texel: np.ndarray, kept: Sequence[np.ndarray], turned: Sequence[np.ndarray]) -> None:
+        words, fits = agreement.told(places, texel, self.shots.lightings[: len(kept)], np.stack(kept), np.stack(turned))
         self.progress.say(words) if fits else self.progress.warn(words)
 
     def _write(self, manifest: Manifest, kind: str, index: int, places: Places, light: np.ndarray) -> None:

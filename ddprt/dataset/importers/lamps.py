@@ -29,7 +29,7 @@ _VECTORS = {
     "direction": ("dx", "dy", "dz"),
     "half_u": ("ux", "uy", "uz"),
     "half_v": ("vx", "vy", "vz"),
-    **{strength: ("r", "g", "b") for strength in ("intensity", "irradiance", "radiance")},
+    **dict.fromkeys(("intensity", "irradiance", "radiance"), ("r", "g", "b")),
 }
 _PLAIN = ("radius", "inner_deg", "outer_deg", "image", "rotation_deg", "scale", "mesh")
 _WORDS = ("image", "mesh")

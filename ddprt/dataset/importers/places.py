@@ -128,7 +128,9 @@ def _on_mesh(recipe: Recipe, folder: Path, shape: tuple[int, int]) -> Places:
         raise UserError(
             f"{recipe.geometry}: got lightmap coordinates that overlap in {lapped} texels, expected each place once; unwrap it anew"
         )
-    single = {name: np.asarray(getattr(atlas, name), np.float32) for name in ("position", "normal", "albedo", "area", "coverage")}
+    single = {
+        name: np.asarray(getattr(atlas, name), np.float32) for name in ("position", "normal", "albedo", "area", "coverage")
+    }
     known = frozenset(("position", "area", "mesh", "albedo"))
     return Places(atlas.slot >= 0, **single, corners=scene.corners, uv=uv, known=known)
 

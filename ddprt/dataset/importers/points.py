@@ -72,9 +72,7 @@ def _spread(count: int, places: Places, seed: int) -> Chosen:
 
 
 def _samples(places: Places, texel: Int[np.ndarray, " points"]) -> Samples:
-    position, normal, albedo = (
-        getattr(places, name)[texel].astype(np.float64) for name in ("position", "normal", "albedo")
-    )
+    position, normal, albedo = (getattr(places, name)[texel].astype(np.float64) for name in ("position", "normal", "albedo"))
     return Samples(position, normal, albedo, float(np.sqrt(places.area.sum(dtype=np.float64) / len(texel))))
 
 

@@ -37,7 +37,9 @@ class Recipe(Section):
     area: str = Field("", description="FILE  m² of every texel; from positions, or all alike, by default")
     geometry: str = Field("", description="FILE  .glb, .gltf or .obj with lightmap coordinates (TEXCOORD_1), metres, Y up")
     points: str = Field("128", description="how many texels of the direct maps to measure, or a points.json")
-    measure: Literal["auto", "texels", "ball"] = Field("auto", description="auto, texels, or ball: a white ball under the lights")
+    measure: Literal["auto", "texels", "ball"] = Field(
+        "auto", description="auto, texels, or ball: a white ball under the lights"
+    )
     test: float = Field(0.2, gt=0, lt=1, description="share of lightings that are held out")
     validation: float = Field(0.1, gt=0, lt=1, description="share that learned methods stop on")
     seed: int = Field(0, ge=0, le=2**32 - 1, description="of the split and the points")
@@ -84,7 +86,9 @@ def load_recipe(source: Path, options: Mapping[str, str]) -> tuple[Recipe, Path,
     if recipe.colour != "auto":
         SPACES[recipe.colour]
     if recipe.test + recipe.validation >= 1:
-        raise UserError(f"--test: got {recipe.test:g} beside validation {recipe.validation:g}, expected a sum below 1; lower one")
+        raise UserError(
+            f"--test: got {recipe.test:g} beside validation {recipe.validation:g}, expected a sum below 1; lower one"
+        )
     return recipe, folder, [f"{key}: {value}" for key, value in found.items()]
 
 
