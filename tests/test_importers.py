@@ -54,11 +54,11 @@ def test_acescg_to_rec709_is_the_published_matrix() -> None:
 
 DETECTED: dict[str, tuple[tuple[str, str, dict[str, str], Any, bool], str]] = {
     "asked": (("acescg", "a.exr", {"colorspace": "srgb"}, None, False), "acescg (as asked)"),
-    "attribute": (("auto", "a_srgb.exr", {"oiio:ColorSpace": "ACEScg"}, AP1, False), 'acescg (the file says oiio:ColorSpace "ACEScg")'),
+    "attribute": (("auto", "a_srgb.exr", {"oiio:ColorSpace": "ACEScg"}, AP1, False), 'acescg (the file says oiio:ColorSpace "ACEScg")'),  # noqa: E501
     "blender's trap": (("auto", "a.exr", {"colorInteropID": "srgb_rec709_display"}, None, False), "srgb (the file says"),
     "blender's data": (("auto", "a.exr", {"colorInteropID": "data"}, None, False), "linear-rec709 (the file says"),
     "chromaticities": (("auto", "a_srgb.exr", {}, AP1, False), "acescg (by the file's chromaticities)"),
-    "own chromaticities": (("auto", "a.exr", {}, (0.7, 0.3, 0.2, 0.7, 0.1, 0.05, 0.3127, 0.329), False), "linear, with the file's own"),
+    "own chromaticities": (("auto", "a.exr", {}, (0.7, 0.3, 0.2, 0.7, 0.1, 0.05, 0.3127, 0.329), False), "linear, with the file's own"),  # noqa: E501
     "name": (("auto", "lamp_lin_rec2020_3.exr", {}, None, False), "linear-rec2020 (by the file's name)"),
     "an innocent name": (("auto", "raw_data.exr", {}, None, False), "linear-rec709 (assumed)"),
     "picture": (("auto", "a.png", {}, None, True), "srgb (taken as sRGB"),
@@ -83,7 +83,9 @@ def test_colours_of_a_file_arrive_in_rec709(tmp_path: Path) -> None:
     byte = np.arange(24, dtype=np.uint8).reshape(4, 6) * 10
     Image.fromarray(np.stack([byte] * 3 + [255 * (byte > 40)], 2).astype(np.uint8)).save(tmp_path / "a.png")
     png = read_picture(tmp_path / "a.png", Wanted("indirect"))
-    assert png.coarse and png.alpha is not None and (png.alpha > 0).sum() == 19
+    assert png.coarse
+    assert png.alpha is not None
+    assert (png.alpha > 0).sum() == 19
     assert abs(float(png.light[3, 5, 0]) - ((230 / 255 + 0.055) / 1.055) ** 2.4) < 1e-6
 
 
@@ -121,7 +123,8 @@ def test_blenders_layers_say_what_they_hold(tmp_path: Path) -> None:
     path = exr(tmp_path / "a.exr", {name: plane(index) for index, name in enumerate(BLENDER)})
     assert read_picture(path, Wanted("direct")).quantity == ""
     found = read_picture(path, Wanted("direct", "*DiffDir"))
-    assert found.quantity == "E/pi" and found.light[0, 0].tolist() == [5, 4, 3]
+    assert found.quantity == "E/pi"
+    assert found.light[0, 0].tolist() == [5, 4, 3]
     assert set(layers(read_channels(path).planes)) == {"", "ViewLayer.DiffDir", "ViewLayer.DiffInd", "ViewLayer.Depth"}
 
 
@@ -181,7 +184,8 @@ def test_faulty_tables_are_told(case: str, tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(TABLES[case][0])
     with pytest.raises(UserError) as caught:
         read_table(tmp_path / "a.csv")
-    assert TABLES[case][1] in str(caught.value) and "\n" not in str(caught.value)
+    assert TABLES[case][1] in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -207,7 +211,8 @@ def test_light_travels_from_where_the_file_points_to(tmp_path: Path) -> None:
     (tmp_path / "a.lp").write_text("1\na b.png 0.5 0.25 2\n")
     ((path, lighting),) = read_lp(tmp_path / "a.lp")
     towards = np.array([0.5, 0.25, 2]) / np.linalg.norm([0.5, 0.25, 2])
-    assert path.name == "a b.png" and np.allclose(lighting[0].direction, -towards)  # type: ignore[attr-defined]
+    assert path.name == "a b.png"
+    assert np.allclose(lighting[0].direction, -towards)
 
 
 def test_the_white_ball_is_lit_by_the_cosine() -> None:
@@ -216,7 +221,8 @@ def test_the_white_ball_is_lit_by_the_cosine() -> None:
     found = measure(Tracer(corners), (light,), samples.position, samples.normal, seed=0)
     cosine = np.maximum(samples.normal @ -np.array([1, 2, -3]) / np.sqrt(14), 0)
     assert np.abs(found - cosine[:, None] * [1, 2, 3]).max() < 1e-5
-    assert np.abs(samples.normal.mean(0)).max() < 0.05 and len(np.unique(samples.normal, axis=0)) == 64
+    assert np.abs(samples.normal.mean(0)).max() < 0.05
+    assert len(np.unique(samples.normal, axis=0)) == 64
 
 
 def test_areas_by_neighbours_are_those_of_the_surface() -> None:
@@ -226,7 +232,8 @@ def test_areas_by_neighbours_are_those_of_the_surface() -> None:
     covered = np.ones((8, 10), bool)
     covered[0] = False
     area = _areas(position, covered)
-    assert np.abs(area[1:, :5] - 0.02).max() < 1e-5 and np.abs(area[1:, 5:] - 0.03).max() < 2e-4
+    assert np.abs(area[1:, :5] - 0.02).max() < 1e-5
+    assert np.abs(area[1:, 5:] - 0.03).max() < 2e-4
 
 
 @pytest.mark.parametrize(

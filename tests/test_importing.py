@@ -72,7 +72,8 @@ def test_what_goes_out_comes_in_again(baked: Dataset, plain: Path, tmp_path: Pat
     """The same arrays, and the same scores of what is learned from them."""
     data = imported(plain, tmp_path / "data", measured="buffers/measured.npy", **BUFFERS)
     every = range(len(baked.lightings))
-    assert (data.covered == baked.covered).all() and (data.area == baked.area).all()
+    assert (data.covered == baked.covered).all()
+    assert (data.area == baked.area).all()
     for kind in ("direct", "indirect"):
         assert (data.maps(kind, every) == baked.maps(kind, every)).all()
     for name in ("position", "albedo", "coverage"):
@@ -109,7 +110,8 @@ def test_a_mesh_brings_the_atlas_that_was_baked(baked: Dataset, plain: Path, tmp
     assert np.median(np.abs(image(data, data.gbuffer["position"]) - image(baked, baked.gbuffer["position"]))[both]) < 1e-5
     again = next(line for line in said if "traced again" in line)
     assert 0.9 < float(again.split("imported / traced ")[1].split(",")[0]) < 1.1, again
-    assert len(data.occluders) == len(baked.occluders) and not data.imported["unmeasured"]
+    assert len(data.occluders) == len(baked.occluders)
+    assert not data.imported["unmeasured"]
     for path in (plain / "direct").iterdir():
         light = ddprt.scene.exr.read_exr(path)[0]
         (tmp_path / "turned" / "direct").mkdir(parents=True, exist_ok=True)
@@ -138,11 +140,17 @@ def test_nothing_is_known_of_bare_pictures_but_where_their_light_is(tmp_path: Pa
     (tmp_path / "lights.csv").unlink()
     with pytest.warns(Doubt, match=r"no file says what it holds: taken as irradiance"):
         data = imported(tmp_path, tmp_path / "out", points="3")
-    assert data.covered.shape == (4, 6) and not data.covered[0, 0] and data.covered[0, 5] and data.covered[3].all()
+    assert data.covered.shape == (4, 6)
+    assert not data.covered[0, 0]
+    assert data.covered[0, 5]
+    assert data.covered[3].all()
     assert (image(data, data.maps("indirect", [0])[0]).reshape(-1, 3) == light).all()
-    assert set(data.area) == {1.0} and data.gbuffer["position"][0].tolist() == [1.5, 0.5, 0]
-    assert data.lightings == ((),) * 5 and len(data.occluders) == 0
-    assert data.imported["lacks"] == ["noise", "mesh"] and data.imported["known"] == []
+    assert set(data.area) == {1.0}
+    assert data.gbuffer["position"][0].tolist() == [1.5, 0.5, 0]
+    assert data.lightings == ((),) * 5
+    assert len(data.occluders) == 0
+    assert data.imported["lacks"] == ["noise", "mesh"]
+    assert data.imported["known"] == []
     assert np.allclose(data.measured([0])[0], 2 * data.maps("indirect", [0])[0][texels(data)], rtol=1e-3)
 
 
@@ -185,8 +193,11 @@ def test_a_white_ball_tells_how_a_matt_relief_looks(tmp_path: Path) -> None:
     """By plain least squares: held-out photographs from values on the ball alone."""
     relief(tmp_path)
     data = imported(tmp_path, tmp_path / "out", points="96")
-    assert data.covered.shape == (14, 12) and data.imported["kind"] == "photographs"
-    assert data.exitant is not None and data.exitant.all() and not data.shaded([0]).any()
+    assert data.covered.shape == (14, 12)
+    assert data.imported["kind"] == "photographs"
+    assert data.exitant is not None
+    assert data.exitant.all()
+    assert not data.shaded([0]).any()
     values, maps = (
         [part(data.split(name)) for name in ("train", "test")] for part in (data.measured, lambda i: data.maps("indirect", i))
     )
@@ -252,15 +263,15 @@ FAULTS: dict[str, tuple[Callable[[Path], None], Options, str]] = {
     "NaN": (_picture("indirect/1.exr", np.nan), {}, "got NaN or infinity in row 2, column 3"),
     "negative": (_picture("indirect/1.exr", -0.1), {}, "got -0.1 in row 2, column 3"),
     "channel": (lambda f: None, {"channels": "*DiffDir"}, 'got no layer that "*DiffDir" names, expected one of RGB'),
-    "fewer lights": (lambda f: (f / "lights.csv").write_text("type,x,y,z,r,g,b\npoint,0,0,1,1,1,1\n"), {}, "got 1 lightings for 5"),
+    "fewer lights": (lambda f: (f / "lights.csv").write_text("type,x,y,z,r,g,b\npoint,0,0,1,1,1,1\n"), {}, "got 1 lightings for 5"),  # noqa: E501
     "names": (lambda f: (f / "lights.csv").write_text("name,type,x,y,z,r,g,b\na,point,0,0,1,1,1,1\n"), {}, 'for picture "0"'),
     "empty mask": (lambda f: write_exr(f / "mask.exr", np.zeros((4, 6, 1), np.float32)), {}, "got an empty mask"),
     "small mask": (lambda f: write_exr(f / "mask.exr", np.ones((4, 4, 1), np.float32)), {}, "got 4 x 4 pixels, expected 6 x 4"),
     "no albedo": (lambda f: None, {"quantity": "radiance"}, "no albedo to divide by"),
     "bright albedo": (_picture("albedo.exr", 2.0), {}, "got albedo 1 to 2, expected 0 to 1"),
-    "black": (lambda f: [write_exr(p, np.zeros((4, 6, 3), np.float32)) for p in (f / "indirect").iterdir()], {}, "got black pictures"),
+    "black": (lambda f: [write_exr(p, np.zeros((4, 6, 3), np.float32)) for p in (f / "indirect").iterdir()], {}, "got black pictures"),  # noqa: E501
     "points": (lambda f: None, {"points": "99"}, "--points: got 99, but 23 texels count"),
-    "point outside": (lambda f: (f / "points.json").write_text('[{"texel": [0, 0]}]'), {"points": "points.json"}, "got texel [0, 0], which does not count"),
+    "point outside": (lambda f: (f / "points.json").write_text('[{"texel": [0, 0]}]'), {"points": "points.json"}, "got texel [0, 0], which does not count"),  # noqa: E501
     "no stars": (lambda f: None, {"direct": "direct/1.exr"}, "with 0 stars, expected one"),
     "no files": (lambda f: None, {"direct": "straight/*.exr"}, 'got no file for "straight/*.exr"'),
     "no quantity": (lambda f: None, {"quantity": "E"}, 'no quantity "E"'),
@@ -271,7 +282,7 @@ FAULTS: dict[str, tuple[Callable[[Path], None], Options, str]] = {
     "wide mesh": (lambda f: None, {"geometry": "room.obj"}, "expected square lightmaps"),
     "vectors": (lambda f: np.save(f / "measured.npy", np.ones((4, 2, 3))), {}, "got 4 lightings for 5 pictures"),
     "no light": (lambda f: shutil.rmtree(f / "indirect"), {}, "got no indirect light"),
-    "cut short": (lambda f: (f / "direct/0.exr").write_bytes((f / "direct/0.exr").read_bytes()[:200]), {}, "not a whole EXR image"),
+    "cut short": (lambda f: (f / "direct/0.exr").write_bytes((f / "direct/0.exr").read_bytes()[:200]), {}, "not a whole EXR image"),  # noqa: E501
     "format": (lambda f: (f / "mask.bmp").touch(), {"mask": "mask.bmp"}, 'got suffix ".bmp"'),
 }  # fmt: skip
 
@@ -283,7 +294,8 @@ def test_faults_are_told_in_one_line(case: str, tmp_path: Path) -> None:
     spoil(tmp_path)
     with pytest.raises(UserError) as caught:
         imported(tmp_path, tmp_path / "out", **{"quantity": "irradiance", "points": "3", **options})
-    assert told in str(caught.value) and "\n" not in str(caught.value)
+    assert told in str(caught.value)
+    assert "\n" not in str(caught.value)
     assert not (tmp_path / "out" / "dataset.json").exists()
 
 
@@ -303,8 +315,10 @@ def test_the_command_line_imports_checks_and_learns(plain: Path, tmp_path: Path,
     small = ["--fit.bases", "4", "--methods.compare", '["svd-ridge"]', "--report.bases_curve", "[1, 4]", "--report.rows", "1"]
     assert call("run", out / "config.toml", *small, "--quiet") == 0
     metrics = json.loads((out / "metrics.json").read_text())
-    assert metrics["methods"]["svd-ridge"]["relative_rmse"] < 1 and metrics["spot_check"] == {}
-    assert "imported" in (out / "report.html").read_text() and (out / "export" / "manifest.json").is_file()
+    assert metrics["methods"]["svd-ridge"]["relative_rmse"] < 1
+    assert metrics["spot_check"] == {}
+    assert "imported" in (out / "report.html").read_text()
+    assert (out / "export" / "manifest.json").is_file()
     capsys.readouterr()
     lamp = '{"type": "point", "position": [0.2, 0.2, 0.2], "intensity": [1, 1, 1]}'
     assert call("relight", out / "model.ddprt", "--lighting", lamp, "--out", tmp_path / "a.exr") == 2

@@ -8,10 +8,10 @@ Blender's module wants a Python of its own, so there are two steps; the first st
     ddprt import FOLDER --out runs/cycles --geometry room.obj --quantity E/pi
     ddprt run runs/cycles/config.toml
 
-`export` writes room.obj and room.mtl (metres, Y up, a flat albedo for each material, lightmap coordinates as `vt`) and lights.csv.
-`bake` writes direct/NAME.exr and indirect/NAME.exr as Cycles has them: diffuse light without colour, which is E/pi, linear
-Rec.709 ("Non-Color", so that `save` leaves the numbers alone), and two texels beyond the edge of charts filled. A point light of
-I W/sr has the power 4 pi I. Settings are those of `cycles_bake.py`: no light tree, no clamping, no denoising, no adaptive sampling.
+`export` writes room.obj and room.mtl (metres, Y up, flat albedos, lightmap coordinates as `vt`) and lights.csv. `bake` writes
+direct/NAME.exr and indirect/NAME.exr as Cycles has them: diffuse light without colour, which is E/pi, linear Rec.709
+("Non-Color", so that `save` leaves the numbers alone), with two texels beyond the edge of charts filled. A light of I W/sr
+has the power 4 pi I. Settings are those of `cycles_bake.py`: no light tree, clamping, denoising or adaptive sampling.
 """
 
 import argparse

@@ -5,9 +5,9 @@
     ddprt import FOLDER --out runs/mitsuba --direct 'pairs/*.exr' --indirect 'pairs/*.exr' --quantity irradiance
     ddprt run runs/mitsuba/config.toml
 
-The maps are pictures of a view: irradiance E (W/m², before albedo) where the middle of each pixel meets the room. Direct light is
-one shadow ray; indirect light is the mean of cosine-weighted paths from there, times pi, which never meet a point light, so that
-they bring what has touched something. Each EXR holds two layers, direct.R to indirect.B; position, normal, albedo and mask lie
+The maps are pictures of a view: irradiance E (W/m², before albedo) where the middle of each pixel meets the room. Direct light
+is one shadow ray; indirect light is the mean of cosine-weighted paths from there, times pi: they never meet a point light, and
+so bring what has touched something. Each EXR holds two layers, direct.R to indirect.B; position, normal, albedo and mask lie
 beside them. To render your own scene, load it in `room` and draw lights in `lamps`.
 """
 

@@ -42,8 +42,8 @@ def load_scene(source: str | Path, **parameters: float | int) -> Scene:
     suffix = path.suffix.lower()
     if name == IMPORTED:
         raise UserError(
-            f'scene.name: got "{IMPORTED}", expected a scene: this run holds light that was imported, which `ddprt fit`, `eval` '
-            "and `export` work on; what traces light needs a scene of its own"
+            f'scene.name: got "{IMPORTED}", expected a scene: this run holds light that was imported, which `ddprt fit`, '
+            "`eval` and `export` work on; what traces light needs a scene of its own"
         )
     if suffix not in SUFFIXES and isinstance(source, str) and not path.suffix and not re.search(r"[/\\]", name):
         known = ", ".join(sorted(SCENES))
@@ -84,9 +84,7 @@ def load_lightmapped(path: Path) -> Scene:
     """
     suffix = path.suffix.lower()
     if suffix not in (".glb", ".gltf", ".obj"):
-        raise UserError(
-            f'{path}: got suffix "{path.suffix}", expected .glb, .gltf or .obj, which have coordinates of lightmaps'
-        )
+        raise UserError(f'{path}: got suffix "{path.suffix}", expected .glb, .gltf or .obj, which have lightmap coordinates')
     if not path.is_file():
         raise UserError(f"{path}: got no such file, expected a mesh; check the path")
     try:

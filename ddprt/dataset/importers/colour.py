@@ -47,8 +47,12 @@ SPACES: Catalogue[Space] = Catalogue(
                 "linear_rec_709",
                 "linear_rec709",
                 "rec709_linear",
-            )
-            + ("linear_srgb", "lin_srgb", "non_color", "raw", "data"),
+                "linear_srgb",
+                "lin_srgb",
+                "non_color",
+                "raw",
+                "data",
+            ),
         ),
         "srgb": Space(
             (*_REC709, *_D65),

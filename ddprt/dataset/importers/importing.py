@@ -128,7 +128,7 @@ class _Import:
             self.progress.warn("pictures of 8 bits a channel are taken as sRGB: dark places are coarse, bright ones cut off")
         if dark:
             self.progress.warn(f"{dark} of {len(self.shots.indirect)} pictures are black")
-        return lit.shape, lit if alpha is None or not alpha.any() else alpha, self._quantity(quantities)  # type: ignore[return-value]
+        return lit.shape, lit if alpha is None or not alpha.any() else alpha, self._quantity(quantities)
 
     def _quantity(self, said: set[str]) -> Quantity:
         if self.recipe.quantity != "auto":
@@ -138,8 +138,8 @@ class _Import:
         known = said - {""}
         if len(said) > 1 or not known <= set(QUANTITIES):
             raise UserError(
-                f"--quantity: got pictures that say {' and '.join(sorted(name or 'nothing' for name in said))}, expected one of "
-                f"{', '.join(QUANTITIES)}; say which"
+                f"--quantity: got pictures that say {' and '.join(sorted(name or 'nothing' for name in said))}, expected one "
+                f"of {', '.join(QUANTITIES)}; say which"
             )
         if not known:
             self.progress.warn("no file says what it holds: taken as irradiance E in W/m²; say otherwise with --quantity")
@@ -169,7 +169,7 @@ class _Import:
         return found
 
     def _points(self, places: Places) -> tuple[Chosen | None, Samples, np.ndarray, str]:
-        """Texels to measure (if it is these), places of the values, what casts shadows on them, and why none can be measured."""
+        """Texels to measure (if any), places of the values, what casts shadows on them, why none can be measured."""
         how = self.recipe.measure
         if how == "auto":
             how = "ball" if self.shots.kind == "photographs" else "texels"

@@ -1,8 +1,8 @@
 """Tables of lights: which lamps shone in which picture.
 
-JSON is ddprt's own list of lightings; an entry may also be {"name": .., "split": .., "lights": [..]}. In a CSV a row is a light:
+JSON is ddprt's own list; an entry may also be {"name": .., "split": .., "lights": [..]}. In a CSV a row is a light:
 
-    name        of the lighting; rows of one name are on together. Left out, each row is a lighting, in the order of the pictures
+    name        of the lighting; rows of one name are on together. Without it a row is a lighting, in the order of pictures
     split       train, validation or test; of all lightings or of none
     type        point, spot, directional, rect, sphere, environment or mesh
     x y z       position, or centre; metres

@@ -35,7 +35,7 @@ def read_lp(path: Path) -> list[tuple[Path, Lighting]]:
         raise UserError(f'{path}: got "{(lines or [""])[0][:40]}" first, expected the number of photographs; mend the file')
     if int(lines[0]) != len(lines) - 1:
         raise UserError(f"{path}: got {len(lines) - 1} lines for {lines[0]} photographs, expected as many; mend the file")
-    found = []
+    found: list[tuple[Path, Lighting]] = []
     for number, line in enumerate(lines[1:], 1):
         name, *words = line.rsplit(None, 3)
         try:

@@ -126,7 +126,7 @@ def _on_mesh(recipe: Recipe, folder: Path, shape: tuple[int, int]) -> Places:
     lapped = int((atlas.coverage > _LAPPED).sum())
     if lapped:
         raise UserError(
-            f"{recipe.geometry}: got lightmap coordinates that overlap in {lapped} texels, expected each place once; unwrap it anew"
+            f"{recipe.geometry}: got lightmap coordinates that overlap in {lapped} texels, expected each once; unwrap it anew"
         )
     single = {
         name: np.asarray(getattr(atlas, name), np.float32) for name in ("position", "normal", "albedo", "area", "coverage")

@@ -1,4 +1,4 @@
-"""From what other programs write to the irradiance that a dataset holds: one factor, and the albedo where it is in the light."""
+"""From what other programs write to the irradiance that a dataset holds: a factor, and the albedo where light has it."""
 
 from dataclasses import dataclass
 
@@ -50,4 +50,4 @@ def irradiance(
 
 def divisible(albedo: Float32[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
     """Where light can be freed of the albedo."""
-    return (albedo >= DARKEST).all(1)
+    return np.asarray((albedo >= DARKEST).all(1))

@@ -86,9 +86,7 @@ def load_recipe(source: Path, options: Mapping[str, str]) -> tuple[Recipe, Path,
     if recipe.colour != "auto":
         SPACES[recipe.colour]
     if recipe.test + recipe.validation >= 1:
-        raise UserError(
-            f"--test: got {recipe.test:g} beside validation {recipe.validation:g}, expected a sum below 1; lower one"
-        )
+        raise UserError(f"--test: got {recipe.test:g} and {recipe.validation:g}, expected a sum below 1; lower one")
     return recipe, folder, [f"{key}: {value}" for key, value in found.items()]
 
 
