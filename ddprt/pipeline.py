@@ -14,12 +14,14 @@ from ddprt.config import Config
 from ddprt.dataset.forecast import Forecast, forecast
 from ddprt.dataset.forecast_effects import belongs
 from ddprt.dataset.generate import bake
+from ddprt.dataset.importers.places import stored_scene
 from ddprt.dataset.sameness import check_skies, other_settings
 from ddprt.dataset.store import Dataset, open_dataset
 from ddprt.errors import UserError
 from ddprt.files import make_folder, write_text
 from ddprt.machine import machine, peak_memory_gib
 from ddprt.progress import Progress
+from ddprt.scene.files import IMPORTED
 from ddprt.scene.mesh import Scene
 from ddprt.transport.effects import Plan, configured_scene, plan
 from ddprt.transport.glossiness import valid_integrator
@@ -72,7 +74,12 @@ class Run:
             check_eyes(self.scene, self.config.report.views, layers=self.config.effects.glossy_layers)
 
     def bake(self) -> Dataset:
-        """Bakes (or goes on with, or finds finished) the dataset; writes the resolved configuration."""
+        """Bakes (or goes on with, or finds finished) the dataset; writes the resolved configuration.
+
+        Imported light is taken as it is.
+        """
+        if self.config.scene.name == IMPORTED:
+            return self.dataset()
         self._check()
         scene = self.scene
         make_folder(self.folder)
@@ -114,8 +121,12 @@ class Run:
         """
         if not (self.folder / "dataset" / "dataset.json").is_file():
             raise UserError(f"{self.folder}: got no dataset, expected a run folder; run `ddprt bake` with the same --out first")
-        self._check_views()
         data = open_dataset(self.folder / "dataset")
+        if data.imported and self.config.scene.name == IMPORTED:
+            if self.config.report.views:
+                raise UserError("report.views: got some, but imported light is seen in its maps alone; leave them out")
+            return data
+        self._check_views()
         differs = other_settings(data.description, self.config, self.scene)
         if differs:
             name = data.description["scene"]["name"]
@@ -178,7 +189,7 @@ class Run:
         with self.progress.stage("bases curve"):
             evaluation.curve = bases_curve(data, self.config, evaluation.truth)
         with self.progress.stage("spot check") as stage:
-            evaluation.spot_check = spot_check(self.scene, data, self.config)
+            evaluation.spot_check = {} if data.imported else spot_check(self.scene, data, self.config)
             stage.facts |= {key: evaluation.spot_check[key] for key in ("rays",) if key in evaluation.spot_check}
         summary = {key: value for key, value in evaluation.spot_check.items() if key not in ("baked", "truth", "variance")}
         evaluation.metrics["spot_check"] = summary
@@ -224,7 +235,7 @@ class Run:
                 models=models,
                 config=self.config,
                 stages=self.progress.stages,
-                scene=self.scene,
+                scene=stored_scene(data) if data.imported else self.scene,
                 plan_effects=self.effects(data).effects,
                 effect_costs={str(row["name"]): row for row in self.costs(data)},
                 command=self.command,
@@ -280,12 +291,14 @@ class Run:
         return tune(self.config, self.folder / "tune", self.progress)
 
     def effects(self, data: Dataset) -> Plan:
-        """The plan that the dataset was baked under."""
+        """The plan that the dataset was baked under; empty for imported light."""
+        if data.imported:
+            return Plan((), 0)
         return plan(self.scene, data.lightings, bounces=self.config.transport.bounces, probes=self.config.probes.asked)
 
     def costs(self, data: Dataset) -> list[dict[str, Any]]:
         """The plan's effects with their rays, seconds and share of the light."""
-        return _effects(self.effects(data), self.progress.stages, data)
+        return [] if data.imported else _effects(self.effects(data), self.progress.stages, data)
 
     def all(self) -> dict[str, Path]:
         """Everything, and where it is."""

@@ -71,6 +71,32 @@ def inspect(call: Call) -> None:
     print(describe(call.file("a configuration, a scene name or a mesh"), call.overrides))
 
 
+def import_(call: Call) -> None:
+    """make a dataset of what others rendered or photographed"""
+    from ddprt.config import checked
+    from ddprt.dataset.importers.importing import import_dataset
+    from ddprt.dataset.importers.recipe import load_recipe
+    from ddprt.files import make_folder, write_text
+    from ddprt.progress import Progress
+    from ddprt.scene.files import IMPORTED
+
+    source, given = Path(call.file("a folder of pictures, or a TOML recipe")), dict(call.options)
+    out, quiet = Path(given.pop("out", "") or Path("runs") / source.resolve().stem), given.pop("quiet", None) is not None
+    given |= {"clip": "true"} if "clip" in given else {}
+    recipe, folder, found = load_recipe(source, given)
+    progress = Progress(quiet)
+    for line in found:
+        progress.say(f"found: {line}")
+    make_folder(out)
+    data = import_dataset(recipe, folder, out / "dataset", progress)
+    sizes = {name: len(data.split(name)) for name in ("train", "validation", "test")}
+    document = {"scene": {"name": IMPORTED}, "lightings": sizes, "points": {"count": len(data.samples.position)}}
+    write_text(out / "import.toml", recipe.to_toml())
+    if not (out / "config.toml").exists():  # what was changed in it since stays
+        write_text(out / "config.toml", checked({**document, "seed": recipe.seed}).to_toml())
+    print(f"dataset:  {data.folder}\nconfig:   {out / 'config.toml'}")
+
+
 def bake(call: Call) -> None:
     """render the dataset of direct and indirect lightmaps"""
     job = call.run()
@@ -327,10 +353,36 @@ _LIMITS = {
     "max-bake-seconds": "X  most seconds to bake what is learned from",
     "max-fit-seconds": "X  most seconds to fit",
 }
+_SOURCES = {
+    "indirect": "'indirect/*.exr'  pictures to learn; the star stands for the name of the lighting",
+    "direct": "'direct/*.exr'  pictures of direct light",
+    "measured": "FILE  measured values, .npy, .npz or .csv, (lightings, points, 3), in place of direct light",
+    "lights": "FILE  .csv or .json table of lights, or an .lp file and its photographs",
+    "channels": "LAYER|R,G,B  of an EXR with several, wildcards allowed",
+    "direct-channels": "LAYER|R,G,B  of direct light alone",
+    "indirect-channels": "LAYER|R,G,B  of indirect light alone",
+    "colour": "NAME  colour space (default: auto, what the files say)",
+    "quantity": "NAME  irradiance, E/pi, radiosity, radiance or exitant (default: auto)",
+    "albedo": "FILE  of every texel",
+    "mask": "FILE  texels that count, above 0",
+    "position": "FILE  of every texel, metres",
+    "normal": "FILE  of every texel",
+    "area": "FILE  of every texel, m²",
+    "geometry": "FILE  .glb, .gltf or .obj with lightmap coordinates, metres, Y up",
+    "points": "N|FILE.json  texels of the direct maps to measure (default: 128)",
+    "measure": "texels|ball  direct light at texels, or a white ball under the lights",
+    "test": "X  share of lightings that are held out (default: 0.2)",
+    "validation": "X  share that learned methods stop on (default: 0.1)",
+    "seed": "N  of the split and the points",
+    "name": "NAME  of the scene in reports",
+}
 VERBS = {
     "run": Verb(run, options=_OUT),
     "inspect": Verb(inspect, "FILE.toml|SCENE|MESH"),
     "bake": Verb(bake, options=_OUT, flags={"dry-run": "tell seconds, rays, files and memory beforehand; writes nothing"}),
+    "import": Verb(
+        import_, "DIR|FILE.toml", _OUT | _SOURCES, {"clip": "cut negative light off instead of refusing it"}, configured=False
+    ),
     "fit": Verb(fit, options=_OUT),
     "eval": Verb(
         evaluate, options=_OUT, flags={"budget": "  take the error apart by its causes (section [budget]); bakes more"}
@@ -370,4 +422,4 @@ VERBS = {
     "verify": Verb(verify, "DIR", configured=False),
     "doctor": Verb(doctor, "", configured=False),
 }
-LATER = {"import", "status"}
+LATER = {"status"}

@@ -212,7 +212,7 @@ def _stitched(model: Model, images: list[np.ndarray], gutter: int, stitch: bool)
     if model.uv is None:
         return images, {
             "stitched": False,
-            "why": "a model of an older version, without lightmap coordinates; bake and fit again",
+            "why": "no lightmap coordinates: the light was imported without a mesh, or an older version baked it",
         }
     stitcher = Stitcher(find_seams(model.occluders, model.uv, _known(model, gutter)))
     closed = [stitcher.stitch(image) for image in images]

@@ -131,7 +131,7 @@ def fit_method(
         data.covered,
         data.area,
         data.occluders,
-        {key: data.description["scene"][key] for key in ("name", "digest")},
+        {key: data.description["scene"][key] for key in ("name", "digest")} | _unmeasured(data),
         data.uv,
         yardstick,
         Catalogue("layer", of_layers),
@@ -141,6 +141,12 @@ def fit_method(
         None if isinstance(data, LayerData) else data.gbuffer["albedo"],
         None if isinstance(data, LayerData) else data.fog,
     )
+
+
+def _unmeasured(data: Dataset) -> dict[str, str]:
+    """Why a model of imported light cannot measure lamps by itself, where it cannot."""
+    why = "" if isinstance(data, LayerData) else data.imported.get("unmeasured", "")
+    return {"unmeasured": why} if why else {}
 
 
 def _with_trouble_of(relighter: Relighter, of_layers: Mapping[str, FitReport]) -> Relighter:

@@ -182,3 +182,8 @@ def bilinear(image: Float[np.ndarray, "height width ..."], uv: Float[np.ndarray,
     top = image[y0, x0] * (1 - fx) + image[y0, x1] * fx
     bottom = image[y1, x0] * (1 - fx) + image[y1, x1] * fx
     return top * (1 - fy) + bottom * fy
+
+
+def plain(material: Material) -> Material:
+    """The same surface with its one albedo alone."""
+    return Material(material.name, material.albedo)
