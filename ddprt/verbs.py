@@ -37,7 +37,6 @@ class Call:
     def run(self) -> Any:
         """The run folder and configuration that the arguments mean."""
         from ddprt.config import load_config
-        from ddprt.pipeline import Run
 
         source = self.file("a configuration such as configs/cornell.toml")
         if _is_scene(source):
@@ -47,6 +46,10 @@ class Call:
             )
         config = load_config(source, self.overrides)
         default = Path(source).parent if Path(source).name == "config.toml" else Path("runs") / Path(source).stem
+        if config.animated:
+            from ddprt.pipeline_animation import AnimatedRun as Run
+        else:
+            from ddprt.pipeline import Run  # type: ignore[assignment]
         return Run(config, Path(self.options.get("out") or default), command=self.command, quiet=self.quiet)
 
 
@@ -198,7 +201,6 @@ def relight(call: Call) -> None:
 
     from ddprt.lights import load_lightings, parse_lighting
     from ddprt.methods.method import STATUSES
-    from ddprt.runtime.model_file import load_model
     from ddprt.scene.exr import write_exr
 
     source, out = call.options.get("lighting"), Path(call.options.get("out", "relit.exr"))
@@ -208,7 +210,7 @@ def relight(call: Call) -> None:
         )
     if out.suffix != ".exr":
         raise UserError(f"--out: got {out}, expected a path that ends in .exr; name it so")
-    model = load_model(call.file("a model folder such as runs/cornell/model.ddprt"))
+    model = _model_at(call.file("a model folder such as runs/cornell/model.ddprt"), call.options.get("time"))
     if source.lstrip().startswith(("[", "{")):
         try:
             records = json.loads(source)
@@ -239,12 +241,31 @@ def relight(call: Call) -> None:
             print(f"warning: lighting {index}: extrapolating: {STATUSES['extrapolating']}", file=sys.stderr)
 
 
+def _model_at(folder: str, time: str | None) -> Any:
+    """The model of a folder; of what moves, at a time in seconds."""
+    from ddprt.runtime.animated_file import is_animated, load_animated
+    from ddprt.runtime.model_file import load_model
+
+    if is_animated(folder) != (time is not None):
+        moves = "an animation and no --time, expected seconds" if time is None else "--time and a model that stands still"
+        raise UserError(f"ddprt relight: got {moves}; {'add it' if time is None else 'leave it out'}")
+    if time is None:
+        return load_model(folder)
+    try:
+        seconds = float(time)
+    except ValueError:
+        raise UserError(f"--time: got {time}, expected seconds; give a number") from None
+    return load_animated(folder).at(seconds)
+
+
 def export(call: Call) -> None:
     """write basis textures, matrices and a manifest for engines"""
+    from ddprt.runtime.animated_file import is_animated, load_animated
     from ddprt.runtime.model_file import load_model
 
     job = call.run()
-    job.export(load_model(job.folder / "model.ddprt"))
+    folder = job.folder / "model.ddprt"
+    job.export(load_animated(folder) if is_animated(folder) else load_model(folder))
     print(f"textures: {job.folder / 'export'}")
 
 
@@ -320,7 +341,11 @@ VERBS = {
     "relight": Verb(
         relight,
         "MODEL",
-        {"lighting": "FILE|JSON  a list of lightings, or one as text", "out": "FILE.exr  where to (default: relit.exr)"},
+        {
+            "lighting": "FILE|JSON  a list of lightings, or one as text",
+            "out": "FILE.exr  where to (default: relit.exr)",
+            "time": "SECONDS  when, for a model of an animation",
+        },
         configured=False,
     ),
     "export": Verb(export, options=_OUT),

@@ -26,6 +26,7 @@ WALK = [
     "bench",
     "pipeline_active",
     "pipeline",
+    "pipeline_animation",
     "pipeline_inspect",
     "verbs",
     "cli",

@@ -11,7 +11,7 @@ flat.
 import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import pygltflib
@@ -62,7 +62,21 @@ def load_gltf(path: Path) -> Scene:
     with warnings.catch_warnings():
         # pygltflib speaks by warnings; what matters in them is found and refused below.
         warnings.simplefilter("ignore")
-        return _Reader(open_gltf(path)).scene()
+        return Reader(open_gltf(path)).scene()
+
+
+class Pose(Protocol):
+    """How the nodes of a file stand at a time; see `ddprt.scene.gltf_motion`."""
+
+    def local(self, number: int) -> Float64[np.ndarray, "4 4"]:
+        """Transform of a node to its parent."""
+        ...
+
+    def shaped(
+        self, number: int, primitive: Any, positions: Float64[np.ndarray, "vertices 3"], world: Float64[np.ndarray, "4 4"]
+    ) -> tuple[Float64[np.ndarray, "vertices 3"], Float64[np.ndarray, "4 4"]]:
+        """A node's vertices, and what takes them to the world."""
+        ...
 
 
 @dataclass
@@ -77,23 +91,30 @@ class _Part:
 
 
 @dataclass
-class _Reader:
+class Reader:
+    """One reading of a file: as it stands, or in a pose of its animation.
+
+    Attributes:
+      file: what is read.
+      pose: None leaves animations, skins and morph targets aside, and says so.
+    """
+
     file: Container
+    pose: Pose | None = None
     ignored: set[str] = field(default_factory=set)
     notes: list[str] = field(default_factory=list)
     images: dict[tuple[int, Any], np.ndarray] = field(default_factory=dict)
 
-    def scene(self) -> Scene:
+    def scene(self, *, numbered: bool = False) -> Scene:
+        """The checked scene; `numbered` has each vertex' number in `positions` where texture coordinates were."""
         self._extensions()
-        parts = [part for mesh, world in self._placed() for part in self._parts(mesh, world)]
-        if not parts:
-            raise self.file.fault("got no triangles, expected a mesh in the file's scene; export at least one")
+        parts = self._all_parts()
         starts = np.cumsum([0, *[len(part.positions) for part in parts]])
         numbers = sorted({part.material for part in parts})
         materials = tuple(self._material(number) for number in numbers)
-        self.ignored.update(
-            what for what, there in (("animations", self.file.json.animations), ("skins", self.file.json.skins)) if there
-        )
+        moving = (("animations", self.file.json.animations), ("skins", self.file.json.skins))
+        self.ignored.update(what for what, there in moving if there and self.pose is None)
+        uv = np.concatenate([part.uv for part in parts]) if any(entry.textures for entry in materials) else None
         listed = [f"ignored in the file: {', '.join(sorted(self.ignored))}"] if self.ignored else []
         return checked(
             self.file.path.stem,
@@ -102,9 +123,19 @@ class _Reader:
             normals=np.concatenate([part.normals for part in parts]),
             material=np.concatenate([np.full(len(part.triangles), numbers.index(part.material)) for part in parts]),
             materials=materials,
-            uv=np.concatenate([part.uv for part in parts]) if any(entry.textures for entry in materials) else None,
+            uv=np.stack([np.arange(starts[-1], dtype=np.float64)] * 2, 1) if numbered else uv,
             notes=(*self.notes, *listed),
         )
+
+    def positions(self) -> Float64[np.ndarray, "vertices 3"]:
+        """All vertices in world space, before any is dropped by the checks, metres."""
+        return np.concatenate([part.positions for part in self._all_parts()])
+
+    def _all_parts(self) -> list[_Part]:
+        parts = [part for number, world in self._placed() for part in self._parts(number, world)]
+        if not parts:
+            raise self.file.fault("got no triangles, expected a mesh in the file's scene; export at least one")
+        return parts
 
     def _extensions(self) -> None:
         required, used = set(self.file.json.extensionsRequired or []), set(self.file.json.extensionsUsed or [])
@@ -116,7 +147,7 @@ class _Reader:
         self.ignored.update(used - set(UNDERSTOOD))
 
     def _placed(self) -> list[tuple[int, Float64[np.ndarray, "4 4"]]]:
-        """Meshes with their transforms to the world, in the order of the hierarchy."""
+        """Nodes that have a mesh with their transforms to the world, in the order of the hierarchy."""
         nodes, scenes = self.file.json.nodes, self.file.json.scenes
         children = {child for node in nodes for child in node.children or []}
         roots = (
@@ -131,25 +162,25 @@ class _Reader:
                 raise self.file.fault(f"got node {number} twice in the hierarchy, expected a tree; export it again")
             seen.add(number)
             node = self.file.entry("nodes", number)
-            world = parent @ _transform(node)
+            world = parent @ (transform(node) if self.pose is None else self.pose.local(number))
             if node.mesh is not None:
-                placed.append((node.mesh, world))
+                placed.append((number, world))
             waiting += [(child, world) for child in reversed(node.children or [])]
         return placed
 
-    def _parts(self, mesh: int, world: Float64[np.ndarray, "4 4"]) -> list[_Part]:
+    def _parts(self, number: int, world: Float64[np.ndarray, "4 4"]) -> list[_Part]:
         parts = []
-        for primitive in self.file.entry("meshes", mesh).primitives:
+        for primitive in self.file.entry("meshes", self.file.entry("nodes", number).mesh).primitives:
             mode = 4 if primitive.mode is None else primitive.mode
             if mode in (0, 1, 2, 3):
                 self.ignored.add("points and lines")
                 continue
             if mode != 4:
                 raise self.file.fault(f"got a triangle strip or fan (mode {mode}), expected triangle lists; triangulate it")
-            parts.append(self._part(primitive, world))
+            parts.append(self._part(number, primitive, world))
         return parts
 
-    def _part(self, primitive: Any, world: Float64[np.ndarray, "4 4"]) -> _Part:
+    def _part(self, number: int, primitive: Any, world: Float64[np.ndarray, "4 4"]) -> _Part:
         attributes = primitive.attributes
         positions = self.file.accessor(attributes.POSITION, 3)
         count = len(positions)
@@ -162,7 +193,12 @@ class _Reader:
         flat = attributes.NORMAL is None
         normals = np.full((count, 3), np.nan) if flat else self.file.accessor(attributes.NORMAL, 3)
         uv = self._coordinates(primitive, count)
-        if primitive.targets:
+        if self.pose is not None:
+            as_modelled = positions
+            positions, world = self.pose.shaped(number, primitive, positions, world)
+            if positions is not as_modelled:  # the file's normals are of another shape: they are made anew
+                normals = np.full((count, 3), np.nan)
+        elif primitive.targets:
             self.ignored.add("morph targets")
         if getattr(attributes, "COLOR_0", None) is not None:
             self.ignored.add("vertex colours")
@@ -326,7 +362,7 @@ def _placing(texture: Any) -> tuple[int, float, list[float], list[float]]:
     return number, change.get("rotation", 0.0), change.get("scale", [1.0, 1.0]), change.get("offset", [0.0, 0.0])
 
 
-def _transform(node: Any) -> Float64[np.ndarray, "4 4"]:
+def transform(node: Any) -> Float64[np.ndarray, "4 4"]:
     """A node's matrix; glTF stores matrices by columns and applies scale, then rotation, then translation."""
     if node.matrix is not None:
         return np.array(node.matrix, dtype=np.float64).reshape(4, 4).T

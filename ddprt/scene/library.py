@@ -14,6 +14,7 @@ from ddprt.scene.furball import furball
 from ddprt.scene.lion import lion
 from ddprt.scene.material import Cutout, Emission, Gloss, Material, Subsurface
 from ddprt.scene.mesh import Scene
+from ddprt.scene.motions import bending
 from ddprt.scene.shapes import box, faceted, hollow, icosphere, rectangle
 
 
@@ -335,6 +336,7 @@ SCENES: Catalogue[Callable[..., Scene]] = Catalogue(
         "neon": neon,
         "lion": lion,
         "furball": furball,
+        "bending": bending,
     },
 )
 

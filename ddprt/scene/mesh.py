@@ -59,6 +59,7 @@ class Scene:
       forced: effects that a user wants simulated whatever the materials say.
       refused: effects that a user wants left out likewise.
       tubes: strands, of which the last triangles are; None where there are none.
+      rest: the pose of an animation that this one's lightmap is unwrapped on; None where nothing moves.
     """
 
     name: str
@@ -73,6 +74,7 @@ class Scene:
     forced: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
     tubes: Tubes | None = None
+    rest: "Scene | None" = None
 
     @cached_property
     def corners(self) -> Float64[np.ndarray, "triangles 3 3"]:
@@ -128,6 +130,7 @@ class Scene:
         state.update(repr(self.forced).encode() if self.forced else b"")
         if self.tubes is not None:
             state.update(f"{self.tubes.axis.shape}".encode() + self.tubes.radius.tobytes() + self.tubes.colour.tobytes())
+        state.update(b"" if self.rest is None else f"rest {self.rest.digest}".encode())
         return state.hexdigest()[:16]
 
     @cached_property

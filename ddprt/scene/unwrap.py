@@ -29,7 +29,7 @@ def unwrap(
     """Lightmap coordinates of every triangle corner.
 
     Args:
-      scene: what to unwrap.
+      scene: what to unwrap; of a pose its rest pose, so that charts stay on the mesh as it moves.
       resolution: texels per side; the packing fills exactly this square.
       padding: empty texels between charts.
     Returns:
@@ -37,6 +37,7 @@ def unwrap(
     Raises:
       UserError: the charts cannot be packed into so few texels.
     """
+    scene = scene.rest or scene
     key = hashlib.sha256(f"{_FORMAT} {scene.digest} {resolution} {padding} {xatlas.__version__}".encode()).hexdigest()[:24]
     path = cache_folder() / f"unwrap-{key}.npz"
     try:

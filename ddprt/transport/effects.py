@@ -204,8 +204,11 @@ def force(scene: Scene, *, on: Sequence[str] = (), off: Sequence[str] = ()) -> S
 
 
 def configured_scene(config: Config) -> Scene:
-    """The scene of a configuration, with the effects that it forces."""
-    return force(load_scene(config.scene.name, **config.scene.parameters), on=config.effects.on, off=config.effects.off)
+    """The scene of a configuration, with the effects that it forces; of an animation its first pose."""
+    if config.animated:
+        from ddprt.scene.poses import configured_animation as load  # most scenes stand still
+    scene = load(config).key(0) if config.animated else load_scene(config.scene.name, **config.scene.parameters)
+    return force(scene, on=config.effects.on, off=config.effects.off)
 
 
 def _decided(name: str, entry: Entry, question: Question) -> Effect:
@@ -377,6 +380,9 @@ EFFECTS: Catalogue[Entry] = Catalogue(
             cost=lambda question: "as many paths as the noise that is asked for takes, which go from strand to strand",
         ),
         "probes": Entry(_probes, "probes", lambda scene: scene, lambda question: 0.0),  # no lightmap has light from them
+        "animation": Entry(
+            lambda name, asked: Effect(name, bool(asked.scene.rest), "a pose" if asked.scene.rest else "static")
+        ),
     },
 )
 
