@@ -11,7 +11,7 @@ flat.
 import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import pygltflib
@@ -65,6 +65,7 @@ def load_gltf(path: Path) -> Scene:
         return Reader(open_gltf(path)).scene()
 
 
+@runtime_checkable
 class Pose(Protocol):
     """How the nodes of a file stand at a time; see `ddprt.scene.gltf_motion`."""
 

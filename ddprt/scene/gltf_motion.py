@@ -4,6 +4,8 @@ A clip is looked at at a time and gives a pose; `gltf.Reader` then reads the fil
 is read as of a file that stands still. Before its first key and after its last a channel stays as it is there.
 """
 
+import json
+import struct
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -73,12 +75,14 @@ class Clip:
       file: whose.
       name: its own, or its number.
       channels: what moves.
+      resting: weights of morph targets that nodes have by themselves.
       notes: what was mended on the way, in the order it was found.
     """
 
     file: Container
     name: str
     channels: tuple[Channel, ...]
+    resting: dict[int, list[float]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -106,9 +110,8 @@ class ClipPose:
     def local(self, number: int) -> Float64[np.ndarray, "4 4"]:
         """Transform of a node to its parent."""
         node = self.clip.file.entry("nodes", number)
-        moved = {
-            path: self.values[number, path] for path in ("translation", "rotation", "scale") if (number, path) in self.values
-        }
+        paths = [path for path in ("translation", "rotation", "scale") if (number, path) in self.values]
+        moved = {path: self.values[number, path].tolist() for path in paths}
         return transform(_Placed(**{**{key: getattr(node, key) for key in _Placed.__dataclass_fields__}, **moved}))
 
     def shaped(
@@ -125,7 +128,8 @@ class ClipPose:
         """p + sum of w_i d_i."""
         file = self.clip.file
         node = file.entry("nodes", number)
-        given = node.weights or file.entry("meshes", node.mesh).weights or [0.0] * len(primitive.targets)
+        of_mesh = file.entry("meshes", node.mesh).weights or [0.0] * len(primitive.targets)
+        given = self.clip.resting.get(number, of_mesh)
         weights = self.values.get((number, "weights"), np.asarray(given, np.float64))
         if len(weights) != len(primitive.targets):
             raise file.fault(
@@ -240,7 +244,7 @@ def load_clip(path: Path, name: str = "") -> Clip:
     there = tuple(channel for channel in channels if channel is not None)
     if not there:
         raise file.fault(f'got animation "{names[number]}" without a channel that moves a node, expected one; export it again')
-    return Clip(file, names[number], there)
+    return Clip(file, names[number], there, _resting(path))
 
 
 def load_moving(path: Path, name: str, at: Callable[[tuple[float, float]], float]) -> tuple[Scene, Motion, Clip]:
@@ -265,6 +269,13 @@ def load_moving(path: Path, name: str, at: Callable[[tuple[float, float]], float
         return Reader(clip.file, clip.at(time)).positions()[source]
 
     return scene, motion, clip
+
+
+def _resting(path: Path) -> dict[int, list[float]]:
+    """Weights of morph targets that nodes of a file have, which pygltflib passes over."""
+    data = path.read_bytes()
+    text = data[20 : 20 + struct.unpack("<I", data[12:16])[0]] if data[:4] == b"glTF" else data
+    return {number: node["weights"] for number, node in enumerate(json.loads(text)["nodes"]) if "weights" in node}
 
 
 def _channel(file: Container, clip: Any, entry: Any) -> Channel | None:

@@ -20,7 +20,7 @@ TWISTED = 2.0
 """Radians that the statue's head has turned by after a second."""
 
 
-def bending(*, height: float = 1.0, radius: float = 0.12, ground: float = 2.4, rings: int = 24, around: int = 20) -> Scene:
+def bending(*, height: float = 1.0, radius: float = 0.16, ground: float = 1.6, rings: int = 24, around: int = 20) -> Scene:
     """An arm that stands on a floor of two colours, and bows down to one of them as it moves: the light between them changes.
 
     Args:
