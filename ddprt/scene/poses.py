@@ -19,6 +19,9 @@ from ddprt.scene.gltf_motion import Motion, load_moving
 from ddprt.scene.library import SCENES
 from ddprt.scene.mesh import Scene
 from ddprt.scene.motions import MOTIONS
+from ddprt.scene.winding import welded
+
+_TORN = 1e-5  # of the radius: files round positions of one vertex alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,7 +215,7 @@ def _of_files(sources: Sequence[str | Path], keys: int | Sequence[float], clip: 
     scenes = [load_scene(source) for source in sources]
     for source, scene in zip(sources, scenes, strict=True):
         same = scene.positions.shape == scenes[0].positions.shape and np.array_equal(scene.triangles, scenes[0].triangles)
-        if not same:
+        if not same or not _hangs_together(scenes[0], scene):
             raise UserError(
                 f"scene.poses: got {len(scene.triangles)} triangles in {source} that are not those of {sources[0]} "
                 f"({len(scenes[0].triangles)}), expected one topology; export all poses of one mesh without repairs"
@@ -225,6 +228,13 @@ def _of_files(sources: Sequence[str | Path], keys: int | Sequence[float], clip: 
         return positions[k] if time == k else positions[k] + (time - k) * (positions[k + 1] - positions[k])
 
     return _made(scenes[0], times, straight, positions[0])
+
+
+def _hangs_together(first: Scene, other: Scene) -> bool:
+    """Whether vertices at one place in the first pose are so in another: files tell corners apart that a mesh shares."""
+    _, some, number = np.unique(welded(first.positions), return_index=True, return_inverse=True)
+    apart = np.abs(other.positions - other.positions[some[number]]).max()
+    return bool(apart <= _TORN * other.radius)
 
 
 def _made(scene: Scene, times: np.ndarray, motion: Motion, first: np.ndarray) -> Animation:
