@@ -23,7 +23,8 @@ from ddprt.machine import machine, peak_memory_gib
 from ddprt.progress import Progress
 from ddprt.scene.files import IMPORTED
 from ddprt.scene.mesh import Scene
-from ddprt.transport.effects import Plan, configured_scene, plan
+from ddprt.transport.configured import configured_scene
+from ddprt.transport.effects import Plan, plan
 from ddprt.transport.glossiness import valid_integrator
 
 _AFTER_BAKE = ("fit", "evaluate", "bases curve", "spot check", "report", "export")

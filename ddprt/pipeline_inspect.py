@@ -24,7 +24,8 @@ def describe(source: str, overrides: dict[str, str]) -> str:
     """
     from ddprt.dataset.generate import check_points
     from ddprt.dataset.sameness import baked_settings
-    from ddprt.transport.effects import configured_scene, plan
+    from ddprt.transport.configured import configured_scene
+    from ddprt.transport.effects import plan
     from ddprt.transport.embree import Tracer
     from ddprt.transport.openness import build_open_atlas
 

@@ -53,6 +53,22 @@ class SceneConfig(Section):
     name: str = Field("cornell", description="a name of SCENES, or a path to an .obj, .ply, .stl, .gltf or .glb file")
     parameters: dict[str, float] = Field({}, description="numbers that a scene in code takes, e.g. {albedo = 0.5}")
     fog: FogConfig = FogConfig()
+    poses: tuple[str, ...] = Field((), description="mesh files of one topology, keyframes of an animation, in place of name")
+
+
+class AnimationConfig(Section):
+    """Keyframes of what moves: none unless they are asked for here, or by scene.poses."""
+
+    keys: Annotated[int, Field(ge=0, le=256)] | tuple[float, ...] = Field(
+        0, description="how many, evenly over the motion, or their times in seconds; 0: the scene stands still"
+    )
+    between: tuple[Annotated[float, Field(gt=0.0, lt=1.0)], ...] = Field(
+        (0.5,), description="shares of the way from key to key at which poses are tested that nobody learned from"
+    )
+    matrices: Literal["one", "each", "both"] = Field(
+        "both", description="transfer matrices: one for all keys, one for each, or both compared and those of each kept"
+    )
+    clip: str = Field("", description="name or number of the animation in a glTF file; empty: the first")
 
 
 class AtlasConfig(Section):

@@ -1,61 +1,12 @@
 """The verbs of the command line: what each does with what was typed. Imports stay inside them, so that help is instant."""
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
+from ddprt.call import Call
 from ddprt.errors import UserError
-
-
-@dataclass
-class Call:
-    """What was typed after the verb."""
-
-    verb: str
-    files: list[str] = field(default_factory=list)
-    options: dict[str, str] = field(default_factory=dict)
-    overrides: dict[str, str] = field(default_factory=dict)
-    command: str = ""
-
-    @property
-    def quiet(self) -> bool:
-        """Whether progress is hidden."""
-        return "quiet" in self.options
-
-    def asks(self, flag: str) -> bool:
-        """Whether a flag was given."""
-        return flag in self.options
-
-    def file(self, what: str) -> str:
-        """The one file argument."""
-        if len(self.files) != 1:
-            raise UserError(f"ddprt {self.verb}: got {len(self.files)} files, expected {what}; see `ddprt {self.verb} --help`")
-        return self.files[0]
-
-    def run(self) -> Any:
-        """The run folder and configuration that the arguments mean."""
-        from ddprt.config import load_config
-        from ddprt.pipeline import Run
-
-        source = self.file("a configuration such as configs/cornell.toml")
-        if _is_scene(source):
-            raise UserError(
-                f"ddprt {self.verb}: got the scene {source}, expected a configuration; "
-                f"write ddprt {self.verb} configs/cornell.toml --scene.name {source}"
-            )
-        config = load_config(source, self.overrides)
-        default = Path(source).parent if Path(source).name == "config.toml" else Path("runs") / Path(source).stem
-        return Run(config, Path(self.options.get("out") or default), command=self.command, quiet=self.quiet)
-
-
-def _is_scene(source: str) -> bool:
-    """Whether a scene stands where a configuration should."""
-    from ddprt.scene.files import SUFFIXES
-    from ddprt.scene.library import SCENES
-
-    return Path(source).suffix.lower() in SUFFIXES or (source in SCENES and not Path(source).is_file())
+from ddprt.verbs_alone import doctor, import_, relight, verify, view
 
 
 def run(call: Call) -> None:
@@ -69,32 +20,6 @@ def inspect(call: Call) -> None:
     from ddprt.pipeline_inspect import describe
 
     print(describe(call.file("a configuration, a scene name or a mesh"), call.overrides))
-
-
-def import_(call: Call) -> None:
-    """make a dataset of what others rendered or photographed"""
-    from ddprt.config import checked
-    from ddprt.dataset.importers.importing import import_dataset
-    from ddprt.dataset.importers.recipe import load_recipe
-    from ddprt.files import make_folder, write_text
-    from ddprt.progress import Progress
-    from ddprt.scene.files import IMPORTED
-
-    source, given = Path(call.file("a folder of pictures, or a TOML recipe")), dict(call.options)
-    out, quiet = Path(given.pop("out", "") or Path("runs") / source.resolve().stem), given.pop("quiet", None) is not None
-    given |= {"clip": "true"} if "clip" in given else {}
-    recipe, folder, found = load_recipe(source, given)
-    progress = Progress(quiet)
-    for line in found:
-        progress.say(f"found: {line}")
-    make_folder(out)
-    data = import_dataset(recipe, folder, out / "dataset", progress)
-    sizes = {name: len(data.split(name)) for name in ("train", "validation", "test")}
-    document = {"scene": {"name": IMPORTED}, "lightings": sizes, "points": {"count": len(data.samples.position)}}
-    write_text(out / "import.toml", recipe.to_toml())
-    if not (out / "config.toml").exists():  # what was changed in it since stays
-        write_text(out / "config.toml", checked({**document, "seed": recipe.seed}).to_toml())
-    print(f"dataset:  {data.folder}\nconfig:   {out / 'config.toml'}")
 
 
 def bake(call: Call) -> None:
@@ -218,120 +143,18 @@ def tune(call: Call) -> None:
     print(f"config:   {job.folder / 'tune' / 'tuned.toml'}")
 
 
-def relight(call: Call) -> None:
-    """turn a lighting into an indirect lightmap: ddprt relight MODEL --lighting lights.json --out relit.exr"""
-    import json
-
-    from ddprt.lights import load_lightings, parse_lighting, scene_lights
-    from ddprt.methods.method import STATUSES
-    from ddprt.runtime.model_file import load_model
-    from ddprt.scene.exr import write_exr
-
-    source, out = call.options.get("lighting"), Path(call.options.get("out", "relit.exr"))
-    if source is None:
-        raise UserError(
-            'ddprt relight: got no --lighting, expected a JSON file or text such as [{"type": "point", ...}]; add it'
-        )
-    if out.suffix != ".exr":
-        raise UserError(f"--out: got {out}, expected a path that ends in .exr; name it so")
-    model = load_model(call.file("a model folder such as runs/cornell/model.ddprt"))
-    if source.lstrip().startswith(("[", "{")):
-        try:
-            records = json.loads(source)
-            several = isinstance(records, list) and bool(records) and isinstance(records[0], list)
-            lightings = [parse_lighting(entry, "--lighting") for entry in (records if several else [records])]
-        except (json.JSONDecodeError, RecursionError) as error:
-            raise UserError(
-                f'--lighting: got text that is not JSON ({error}), expected [{{"type": "point", ...}}] or the like; mend it'
-            ) from None
-    elif Path(source).suffix.lower() in (".glb", ".gltf"):
-        lightings = [scene_lights(source)]
-    else:
-        lightings = load_lightings(source)
-    for index, lighting in enumerate(lightings):
-        path = out if len(lightings) == 1 else out.with_stem(f"{out.stem}_{index:03d}")
-        measured = model.measure(lighting)
-        image, trust = model.image(model.predict(measured, lightings=lighting)), model.trust(measured)
-        if not image.any():
-            print(
-                f"warning: lighting {index} lights no measurement point, so {path} is black; its lamps may stand "
-                "inside a solid, outside the scene, face away or have no intensity",
-                file=sys.stderr,
-            )
-        write_exr(path, image)
-        print(f"lightmap: {path}")
-        if trust is None or not measured.any():
-            continue
-        print(f"trust:    {trust.score:.2f}, an expected error of {1 - trust.score:.0%}")
-        if trust.extrapolating:
-            print(f"warning: lighting {index}: extrapolating: {STATUSES['extrapolating']}", file=sys.stderr)
-
-
 def export(call: Call) -> None:
     """write basis textures, matrices and a manifest for engines"""
+    from ddprt.runtime.animated_file import is_animated, load_animated
     from ddprt.runtime.model_file import load_model
 
     job = call.run()
-    model = load_model(job.folder / "model.ddprt")
+    folder = job.folder / "model.ddprt"
+    model = load_animated(folder) if is_animated(folder) else load_model(folder)
     job.export(model)
     print(f"textures: {job.folder / 'export'}")
     if call.asks("table"):
         print(f"{job.format_table(model)}\ntable:    {job.folder / 'export' / 'formats.json'}")
-
-
-def view(call: Call) -> None:
-    """show a model in the browser, lamps to be dragged: ddprt view MODEL, or --html FILE.html for a page of its own"""
-    from ddprt.dataset.store import open_dataset
-    from ddprt.export.viewer.pack import pack
-    from ddprt.export.viewer.page import page
-    from ddprt.export.viewer.serve import serve
-    from ddprt.files import write_text
-    from ddprt.runtime.model_file import load_model
-
-    out, port = call.options.get("html"), call.options.get("port", "0")
-    if out is not None and Path(out).suffix not in (".html", ".htm"):
-        raise UserError(f"--html: got {out}, expected a path that ends in .html; name it so")
-    if not (port.isascii() and port.isdigit() and int(port) < 1 << 16):
-        raise UserError(f"--port: got {port}, expected a whole number from 0 to 65535; 0 takes a free one")
-    folder = Path(call.file("a model folder such as runs/cornell/model.ddprt"))
-    model = load_model(folder / "model.ddprt" if (folder / "model.ddprt").is_dir() else folder)
-    data = open_dataset(call.options["dataset"]) if call.asks("dataset") else None
-    made = page(pack(model, data))
-    if out is None:
-        serve(made, int(port), browse=not call.asks("no-open"))
-        return
-    write_text(Path(out), made)
-    print(f"viewer:   {out}")
-
-
-def verify(call: Call) -> None:
-    """find damaged or missing files of a dataset"""
-    from ddprt.dataset.manifest import Manifest
-    from ddprt.dataset.store import expected_files, read_description
-
-    folder = Path(call.file("a dataset or a run folder"))
-    folder = folder / "dataset" if (folder / "dataset").is_dir() else folder
-    description, manifest = read_description(folder), Manifest(folder)
-    faults = manifest.damaged()
-    faults += [f"{name}: not baked yet" for name in expected_files(description) if name not in manifest.entries]
-    if faults:
-        for fault in faults:
-            print(fault)
-        raise UserError(
-            f"{folder}: got {len(faults)} faulty files of {len(expected_files(description))}; "
-            "delete the damaged ones and run the bake again to make them anew"
-        )
-    print(f"{folder}: {len(manifest.entries)} files whole")
-
-
-def doctor(call: Call) -> None:
-    """check that everything ddprt needs works on this machine"""
-    from ddprt.pipeline_inspect import checkup
-
-    lines, fine = checkup()
-    print(lines)
-    if not fine:
-        raise UserError("doctor: got parts that are missing or broken, expected all to work; mend what is marked above")
 
 
 @dataclass(frozen=True)
@@ -402,7 +225,11 @@ VERBS = {
     "relight": Verb(
         relight,
         "MODEL",
-        {"lighting": "FILE|JSON  a list of lightings, or one as text", "out": "FILE.exr  where to (default: relit.exr)"},
+        {
+            "lighting": "FILE|JSON  a list of lightings, or one as text",
+            "out": "FILE.exr  where to (default: relit.exr)",
+            "time": "SECONDS  when, for a model of an animation",
+        },
         configured=False,
     ),
     "export": Verb(

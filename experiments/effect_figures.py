@@ -18,6 +18,7 @@ import ddprt
 from ddprt.config import checked as configured
 from ddprt.dataset.layers import read_layer, read_light
 from ddprt.lights import parse_lighting
+from ddprt.sampling.riding import place_riders
 from ddprt.scene.atlas import build_atlas
 from ddprt.scene.checks import checked
 from ddprt.scene.exr import write_exr
@@ -25,6 +26,7 @@ from ddprt.scene.fog import Fog
 from ddprt.scene.library import build
 from ddprt.scene.material import Cutout, Emission, Gloss, Material, Subsurface
 from ddprt.scene.mesh import Scene
+from ddprt.scene.poses import posed
 from ddprt.scene.shapes import faceted, hollow, icosphere, rectangle
 from ddprt.sections import TransportConfig
 from ddprt.transport import ggx
@@ -332,6 +334,20 @@ def hair(quick: bool) -> Figure:
     return compared(np.mean(runs), 1.0, np.std(runs, ddof=1) / math.sqrt(len(runs)))
 
 
+# --- what moves ----------------------------------------------------------------------------------------------------------
+
+
+def animation(quick: bool) -> Figure:
+    """A ball that has rolled and gone away, seen from inside: its points ride along, and light is a / (1 - a) as before."""
+    ball, turn = build("furnace", albedo=0.5, subdivisions=3), 1.1
+    cosine, sine = math.cos(turn), math.sin(turn)
+    moved = posed(ball, ball.positions @ [[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]] + [3.0, -1.0, 2.0], "rolled")
+    lamp = {"type": "point", "position": [3, -1, 2], "intensity": [1, 1, 1]}
+    riders = place_riders(ball, 256, seed=0, atlas=build_atlas(ball, 64)).at(moved.corners)
+    found, error = light_at(moved, lamp, riders.position, riders.normal, 400 if quick else 6400, part=1)
+    return compared(found.mean(), 4 * math.pi / ball.areas.sum(), np.linalg.norm(error) / len(error))
+
+
 FIGURES: dict[str, Callable[[bool], Figure]] = {
     "diffuse bounces": bounces,
     "point lights": point,
@@ -349,5 +365,6 @@ FIGURES: dict[str, Callable[[bool], Figure]] = {
     "hair": hair,
     "fog": fog,
     "probes": probes,
+    "animation": animation,
 }
 """What tells of each effect that it is right. A new effect is one entry more, or the experiment and its test fail."""

@@ -24,8 +24,9 @@ from ddprt.scene.library import build
 from ddprt.scene.material import Emission, Gloss, Material
 from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import faceted, hollow
+from ddprt.transport.configured import configured_scene
 from ddprt.transport.direct import Texels, centred
-from ddprt.transport.effects import configured_scene, force, plan
+from ddprt.transport.effects import force, plan
 from ddprt.transport.embree import Tracer, lifted
 from ddprt.transport.fog import Air
 from ddprt.transport.fog_reference import stretch, turned

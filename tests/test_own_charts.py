@@ -21,7 +21,7 @@ from ddprt.scene.files import load_scene
 from ddprt.scene.mesh import Scene
 from ddprt.scene.own_charts import charted, fault_of, own_charts
 from ddprt.scene.unwrap import unwrap
-from ddprt.transport.effects import configured_scene
+from ddprt.transport.configured import configured_scene
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning:dataclasses_json")
 

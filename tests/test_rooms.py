@@ -26,7 +26,10 @@ WALK = [
     "bench",
     "pipeline_active",
     "pipeline",
+    "pipeline_animation",
     "pipeline_inspect",
+    "call",
+    "verbs_alone",
     "verbs",
     "cli",
 ]

@@ -474,7 +474,7 @@ def test_glb_header_is_held_against_the_length(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("source", "parameters", "says"),
     [
-        ("cornel", {}, 'did you mean "cornell".*known: convex, .*or a path that ends in .glb'),
+        ("cornel", {}, 'did you mean "cornell".*known: bending, convex, .*or a path that ends in .glb'),
         ("room.fbx", {}, 'suffix ".fbx", expected .glb'),
         ("some/where", {}, 'suffix ""'),
         ("nowhere/room.glb", {}, "no such file"),

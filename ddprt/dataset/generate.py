@@ -57,6 +57,7 @@ def bake(
     first: int | None = None,
     once: Once | None = None,
     progress: Progress | None = None,
+    places: Samples | None = None,
 ) -> Dataset:
     """Renders pairs of direct and indirect lightmaps.
 
@@ -75,6 +76,7 @@ def bake(
       first: of the training lightings that are chosen, bake only so many, the most telling; None bakes all.
       once: of several bakes with this scene and these settings, whatever their `first`: candidates are drawn and measured once.
       progress: shown if given.
+      places: where light is measured, in place of samples that are distributed; of a pose, those that ride on it.
     Returns:
       The finished dataset.
     Raises:
@@ -102,7 +104,9 @@ def bake(
         config, lightings = config.model_copy(update={"lightings": asked}), None
     keep_alive = tempfile.TemporaryDirectory(prefix="ddprt-") if out is None else None
     folder = Path(keep_alive.name if keep_alive else str(out))
-    return _Bake(scene, config, folder, progress or Progress(quiet=True), first, once or Once()).run(lightings, keep_alive)
+    return _Bake(scene, config, folder, progress or Progress(quiet=True), first, once or Once(), places).run(
+        lightings, keep_alive
+    )
 
 
 def check_points(config: Config, scene: Scene, atlas: Atlas) -> None:
@@ -141,9 +145,19 @@ def _records(entries: Sequence[tuple[str, Lighting]]) -> list[dict[str, Any]]:
 class _Bake:
     """One bake from start to end; every stage skips what the manifest already holds."""
 
-    def __init__(self, scene: Scene, config: Config, folder: Path, progress: Progress, first: int | None, once: Once) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        config: Config,
+        folder: Path,
+        progress: Progress,
+        first: int | None,
+        once: Once,
+        places: Samples | None = None,
+    ) -> None:
         scene = charted(scene, config.atlas.use, config.atlas.resolution, config.atlas.padding)
         self.scene, self.config, self.folder, self.progress, self.first = scene, config, folder, progress, first
+        self.places = places
         once.bind(scene.digest, config.model_dump_json(include={"seed", "atlas", "lightings", "points"}))
         self.tracer, self.once = Tracer.of(scene, config.transport.threads), once
 
@@ -264,8 +278,10 @@ class _Bake:
             )
 
     def _listed(self) -> Samples | None:
-        """The points of `points.file`, if it is given."""
+        """The points that are given, as they are or by `points.file`."""
         config = self.config.points
+        if self.places is not None:
+            return self.places
         if not config.file:
             return None
         samples = load_samples(config.file)

@@ -40,7 +40,7 @@ def light_records(path: Path, units: str) -> list[dict[str, Any]]:
             file = open_gltf(path)
             lamps = (file.json.extensions or {}).get(_NAME, {}).get("lights", [])
             found = [
-                _record(file, lamps, node, world, units) for node, world in placed(file) if _NAME in (node.extensions or {})
+                _record(file, lamps, node, world, units) for _, node, world in placed(file) if _NAME in (node.extensions or {})
             ]
     except UserError:
         raise

@@ -14,7 +14,7 @@ from ddprt.axes import Float64
 from ddprt.errors import UserError
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _EMPTY = 1 << 22
 """Rows of an accessor that no bytes stand behind: a count alone must not fill the memory."""
 

@@ -6,7 +6,7 @@ a body is never turned inside out: a room is seen from inside, and only its make
 
 import numpy as np
 
-from ddprt.axes import Float, Int
+from ddprt.axes import Bool, Float, Int
 from ddprt.errors import UserError
 from ddprt.scene.material import Material
 from ddprt.scene.mesh import Scene
@@ -86,7 +86,7 @@ def checked(
     found = list(notes)
     triangles = triangles.astype(np.int64)
     weld = welded(positions)
-    keep = ~_negligible(positions[triangles])
+    keep = ~negligible(positions[triangles])
     if removed := np.count_nonzero(~keep):
         found.append(f"{removed} triangles of no area removed")
     repeated, backed = repeats(weld[triangles], keep)
@@ -292,7 +292,8 @@ def _areas(corners: np.ndarray) -> np.ndarray:
     return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
 
 
-def _negligible(corners: np.ndarray) -> np.ndarray:
+def negligible(corners: Float[np.ndarray, "triangles 3 3"]) -> Bool[np.ndarray, " triangles"]:
+    """Triangles too low for the tracer, by the bounding box of all of them."""
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     diagonal = np.linalg.norm(np.ptp(corners.reshape(-1, 3), axis=0))
     return 2 * _areas(corners) <= NEGLIGIBLE * diagonal * longest

@@ -19,7 +19,7 @@ import pygltflib
 from ddprt.axes import Float, Float64, Int
 from ddprt.scene.accessors import Container, open_gltf
 from ddprt.scene.checks import UNSAID, checked
-from ddprt.scene.gltf_nodes import placed
+from ddprt.scene.gltf_nodes import Pose, placed
 from ddprt.scene.gltf_primitive import colours_of, triangles_of
 from ddprt.scene.gltf_samplers import wraps
 from ddprt.scene.images import linear_image, plain_image
@@ -65,7 +65,7 @@ def load_gltf(path: Path) -> Scene:
     with warnings.catch_warnings():
         # pygltflib speaks by warnings; what matters in them is found and refused below.
         warnings.simplefilter("ignore")
-        return _Reader(open_gltf(path)).scene()
+        return Reader(open_gltf(path)).scene()
 
 
 @dataclass
@@ -82,32 +82,36 @@ class _Part:
 
 
 @dataclass
-class _Reader:
+class Reader:
+    """One reading of a file: as it stands, or in a pose of its animation.
+
+    Attributes:
+      file: what is read.
+      pose: None leaves animations, skins and morph targets aside, and says so.
+    """
+
     file: Container
+    pose: Pose | None = None
     ignored: set[str] = field(default_factory=set)
     notes: list[str] = field(default_factory=list)
     images: dict[tuple[int, Any], np.ndarray] = field(default_factory=dict)
 
-    def scene(self) -> Scene:
+    def scene(self, *, numbered: bool = False) -> Scene:
+        """The checked scene; `numbered` has each vertex' number in `positions` where texture coordinates were."""
         self._extensions()
-        parts = [part for node, world in placed(self.file) if node.mesh is not None for part in self._parts(node.mesh, world)]
-        if not parts:
-            raise self.file.fault("got no triangles, expected a mesh in the file's scene; export at least one")
+        parts = self._all_parts()
         starts = np.cumsum([0, *[len(part.positions) for part in parts]])
         numbers = sorted({part.material for part in parts})
         materials = tuple(self._material(number) for number in numbers)
         self._lamps()
-        parts_of = (
-            ("animations", self.file.json.animations),
-            ("skins", self.file.json.skins),
-            ("cameras", self.file.json.cameras),
-        )
-        self.ignored.update(what for what, there in parts_of if there)
+        still = (("animations", self.file.json.animations), ("skins", self.file.json.skins)) if self.pose is None else ()
+        self.ignored.update(what for what, there in (*still, ("cameras", self.file.json.cameras)) if there)
         materials = tuple(
             self._rolled_out(material, number, [part for part in parts if part.material == number])
             for material, number in zip(materials, numbers, strict=True)
         )
         colour = np.concatenate([part.colour for part in parts])
+        uv = np.concatenate([part.uv for part in parts]) if any(entry.textures for entry in materials) else None
         listed = [f"ignored in the file: {', '.join(sorted(self.ignored))}"] if self.ignored else []
         return checked(
             self.file.path.stem,
@@ -116,11 +120,22 @@ class _Reader:
             normals=np.concatenate([part.normals for part in parts]),
             material=np.concatenate([np.full(len(part.triangles), numbers.index(part.material)) for part in parts]),
             materials=materials,
-            uv=np.concatenate([part.uv for part in parts]) if any(entry.textures for entry in materials) else None,
+            uv=np.stack([np.arange(starts[-1], dtype=np.float64)] * 2, 1) if numbered else uv,
             colour=colour if (colour != 1).any() else None,
             lightmap=self._lightmap(parts),
             notes=(*self.notes, *listed),
         )
+
+    def positions(self) -> Float64[np.ndarray, "vertices 3"]:
+        """All vertices in world space, before any is dropped by the checks, metres."""
+        return np.concatenate([part.positions for part in self._all_parts()])
+
+    def _all_parts(self) -> list[_Part]:
+        nodes = placed(self.file, self.pose)
+        parts = [part for number, node, world in nodes if node.mesh is not None for part in self._parts(number, world)]
+        if not parts:
+            raise self.file.fault("got no triangles, expected a mesh in the file's scene; export at least one")
+        return parts
 
     def _extensions(self) -> None:
         required, used = set(self.file.json.extensionsRequired or []), set(self.file.json.extensionsUsed or [])
@@ -131,17 +146,17 @@ class _Reader:
                 raise self.file.fault(f"got the required extension {name}, which is not read; export without it")
         self.ignored.update(used - set(UNDERSTOOD))
 
-    def _parts(self, mesh: int, world: Float64[np.ndarray, "4 4"]) -> list[_Part]:
+    def _parts(self, number: int, world: Float64[np.ndarray, "4 4"]) -> list[_Part]:
         parts = []
-        for primitive in self.file.entry("meshes", mesh).primitives:
+        for primitive in self.file.entry("meshes", self.file.entry("nodes", number).mesh).primitives:
             mode = 4 if primitive.mode is None else primitive.mode
             if mode in (0, 1, 2, 3):
                 self.ignored.add("points and lines")
                 continue
-            parts.append(self._part(primitive, world))
+            parts.append(self._part(number, primitive, world))
         return parts
 
-    def _part(self, primitive: Any, world: Float64[np.ndarray, "4 4"]) -> _Part:
+    def _part(self, number: int, primitive: Any, world: Float64[np.ndarray, "4 4"]) -> _Part:
         attributes = primitive.attributes
         if attributes.POSITION is None:
             raise self.file.fault("got a primitive without POSITION, expected places of vertices; export it again")
@@ -154,7 +169,12 @@ class _Reader:
         normals = np.full((count, 3), np.nan) if flat else self._rows("NORMAL", attributes.NORMAL, 3, count)
         uv, colour = self._coordinates(primitive, count), self._colour(primitive, count)
         lightmap = np.full((count, 2), np.nan) if second is None else self._rows("TEXCOORD_1", second, 2, count)
-        if primitive.targets:
+        if self.pose is not None:
+            as_modelled = positions
+            positions, world = self.pose.shaped(number, primitive, positions, world)
+            if positions is not as_modelled:  # the file's normals are of another shape: they are made anew
+                normals = np.full((count, 3), np.nan)
+        elif primitive.targets:
             self.ignored.add("morph targets")
         linear = world[:3, :3]
         mirrored = np.linalg.det(linear) < 0

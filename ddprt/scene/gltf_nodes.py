@@ -1,6 +1,6 @@
 """The nodes of a glTF file, each with its transform to the world."""
 
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -9,9 +9,27 @@ from ddprt.axes import Float64
 from ddprt.scene.accessors import Container
 
 
-def placed(file: Container) -> list[tuple[Any, Float64[np.ndarray, "4 4"]]]:
-    """Every node of the file's default scene with its transform to the world, in the order of the hierarchy.
+@runtime_checkable
+class Pose(Protocol):
+    """How the nodes of a file stand at a time; see `ddprt.scene.gltf_motion`."""
 
+    def local(self, number: int) -> Float64[np.ndarray, "4 4"]:
+        """Transform of a node to its parent."""
+        ...
+
+    def shaped(
+        self, number: int, primitive: Any, positions: Float64[np.ndarray, "vertices 3"], world: Float64[np.ndarray, "4 4"]
+    ) -> tuple[Float64[np.ndarray, "vertices 3"], Float64[np.ndarray, "4 4"]]:
+        """A node's vertices, and what takes them to the world."""
+        ...
+
+
+def placed(file: Container, pose: Pose | None = None) -> list[tuple[int, Any, Float64[np.ndarray, "4 4"]]]:
+    """Every node of the file's default scene: number, node and transform to the world, in the order of the hierarchy.
+
+    Args:
+      file: whose nodes.
+      pose: None takes the transforms of the file.
     Raises:
       UserError: a node that is not there, or that hangs in the hierarchy twice.
     """
@@ -25,13 +43,13 @@ def placed(file: Container) -> list[tuple[Any, Float64[np.ndarray, "4 4"]]]:
             raise file.fault(f"got node {number} twice in the hierarchy, expected a tree; export it again")
         seen.add(number)
         node = file.entry("nodes", number)
-        world = parent @ _transform(node)
-        found.append((node, world))
+        world = parent @ (transform(node) if pose is None else pose.local(number))
+        found.append((number, node, world))
         waiting += [(child, world) for child in reversed(node.children or [])]
     return found
 
 
-def _transform(node: Any) -> Float64[np.ndarray, "4 4"]:
+def transform(node: Any) -> Float64[np.ndarray, "4 4"]:
     """A node's matrix; glTF stores matrices by columns and applies scale, then rotation, then translation."""
     if node.matrix is not None:
         return np.array(node.matrix, dtype=np.float64).reshape(4, 4).T

@@ -16,6 +16,7 @@ from ddprt.scene.furball import furball
 from ddprt.scene.lion import lion
 from ddprt.scene.material import Cutout, Emission, Gloss, Material, Subsurface
 from ddprt.scene.mesh import Scene
+from ddprt.scene.motions import bending
 from ddprt.scene.shapes import box, faceted, hollow, icosphere, rectangle
 
 
@@ -363,6 +364,7 @@ SCENES: Catalogue[Callable[..., Scene]] = Catalogue(
         "lion": lion,
         "furball": furball,
         "foggy-room": foggy_room,
+        "bending": bending,
     },
 )
 

@@ -63,6 +63,7 @@ class Scene:
       colour: linear factor on the albedo per vertex, 0 to 1, or None where it is 1 everywhere.
       lightmap: where the file would have each vertex on a lightmap, unchecked; see `ddprt.scene.own_charts`.
       fog: what fills the bounding box; None for clear air.
+      rest: the pose of an animation that this one's lightmap is unwrapped on; None where nothing moves.
     """
 
     name: str
@@ -80,6 +81,7 @@ class Scene:
     colour: Float64[np.ndarray, "vertices 3"] | None = None
     lightmap: Float64[np.ndarray, "vertices 2"] | None = None
     fog: Fog | None = None
+    rest: "Scene | None" = None
 
     @cached_property
     def corners(self) -> Float64[np.ndarray, "triangles 3 3"]:
@@ -139,6 +141,7 @@ class Scene:
         if self.tubes is not None:
             state.update(f"{self.tubes.axis.shape}".encode() + self.tubes.radius.tobytes() + self.tubes.colour.tobytes())
         state.update(f"{self.fog}".encode() if self.fog else b"")
+        state.update(b"" if self.rest is None else f"rest {self.rest.digest}".encode())
         return state.hexdigest()[:16]
 
     @cached_property

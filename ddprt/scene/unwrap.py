@@ -30,7 +30,7 @@ def unwrap(
     """Lightmap coordinates of every triangle corner: the scene's own where it has sound ones, else new ones.
 
     Args:
-      scene: what to unwrap.
+      scene: what to unwrap; of a pose its rest pose, so that charts stay on the mesh as it moves.
       resolution: texels per side; the packing fills exactly this square.
       padding: empty texels between charts.
     Returns:
@@ -38,6 +38,7 @@ def unwrap(
     Raises:
       UserError: the charts cannot be packed into so few texels.
     """
+    scene = scene.rest or scene
     if scene.lightmap is not None and not fault_of(scene, resolution, padding):
         return own_charts(scene)
     key = hashlib.sha256(f"{_FORMAT} {scene.digest} {resolution} {padding} {xatlas.__version__}".encode()).hexdigest()[:24]

@@ -17,11 +17,9 @@ from ddprt.config import Config
 from ddprt.errors import UserError
 from ddprt.lights import LIGHTS, Lighting, parse_lighting
 from ddprt.progress import amount
-from ddprt.scene.files import load_scene
 from ddprt.scene.holes import pierced
 from ddprt.scene.material import Material
 from ddprt.scene.mesh import Scene
-from ddprt.scene.own_charts import charted
 from ddprt.scene.sheets import backs, without_backs
 from ddprt.sections import TransportConfig
 from ddprt.transport.convexity import sees_nothing
@@ -201,13 +199,6 @@ def force(scene: Scene, *, on: Sequence[str] = (), off: Sequence[str] = ()) -> S
         if name in refused and alone[name].called and entry.without:
             left = entry.without(left)
     return replace(left, whole=whole if left is not whole else None, refused=tuple(sorted(refused)))
-
-
-def configured_scene(config: Config) -> Scene:
-    """The scene of a configuration, with the effects that it forces and the lightmap layout that it takes."""
-    asked, atlas = config.scene, config.atlas
-    scene = load_scene(asked.name, fog=asked.fog.given, **asked.parameters)
-    return charted(force(scene, on=config.effects.on, off=config.effects.off), atlas.use, atlas.resolution, atlas.padding)
 
 
 def _decided(name: str, entry: Entry, question: Question) -> Effect:
@@ -394,5 +385,8 @@ EFFECTS: Catalogue[Entry] = Catalogue(
             cost=lambda question: "as many paths as the noise that is asked for takes, lit all along their way by each lamp",
         ),
         "probes": Entry(_probes, "probes", lambda scene: scene, lambda question: 0.0),  # no lightmap has light from them
+        "animation": Entry(
+            lambda name, asked: Effect(name, bool(asked.scene.rest), "a pose" if asked.scene.rest else "static")
+        ),
     },
 )
