@@ -240,7 +240,7 @@ def relight(call: Call) -> None:
 
 
 def export(call: Call) -> None:
-    """write basis textures, matrices and a manifest for engines"""
+    """write textures, matrices or a network, a shader and a manifest for engines"""
     from ddprt.runtime.model_file import load_model
 
     job = call.run()
