@@ -141,6 +141,16 @@ def test_golden_numbers_are_those_of_the_exported_precision(
     np.testing.assert_allclose(golden["light"], expected, rtol=0, atol=step * np.abs(one.expected).max())
 
 
+def test_golden_light_is_rounded_as_the_textures_are(tmp_path: Path) -> None:
+    """Where nothing is stitched and no gutter is brighter, it is that of the textures to the rounding of floats."""
+    one = exported(tmp_path, model_of(relighters(6, 3)["plain"]), gutter=0, stitch=False)
+    golden = json.loads((tmp_path / "golden.json").read_text())
+    places = tuple(np.transpose(golden["texels"]))
+    exact, unrounded = (one.model.image(light)[places] for light in (one.expected, one.model.predict(one.inputs["values"])))
+    np.testing.assert_allclose(golden["light"], exact, rtol=0, atol=one.tolerance)
+    assert np.abs(np.array(golden["light"]) - unrounded).max() > 2 * one.tolerance
+
+
 @pytest.mark.skipif(VALIDATOR is None, reason="needs glslangValidator (glslang-tools)")
 @EVERY
 def test_shaders_compile(kind: str, channels: str, made: Callable[[str, str], Exported], tmp_path: Path) -> None:

@@ -59,7 +59,7 @@ def export_model(model: Model, folder: str | Path, *, precision: str = "half", *
         "features": list(found.features),
         "network": NETWORK if tensors else None,
         "frame": {name: list(where) for name, where in texel.rows.items()},
-        "shader": {"file": None, "why": why} if why else {"file": SHADER, "reads": texel.taps + texel.mean + texel.constant},
+        "shader": {"file": None, "why": why} if why else {"file": SHADER, "reads": texel.reads},
         "golden": GOLDEN if texel.maps else None,
     }
     write_text(path, json.dumps(manifest, indent=1, ensure_ascii=False) + "\n")

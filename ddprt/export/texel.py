@@ -48,8 +48,13 @@ class Texel:
 
     @property
     def taps(self) -> int:
-        """Reads of a texel, the mean not counted."""
+        """Layers that hold maps."""
         return self.maps if self.rgb else -(-self.maps // LANES)
+
+    @property
+    def reads(self) -> int:
+        """Reads of all textures; a table is read once for each colour."""
+        return (3 if self.shape == "table" else self.taps) + self.mean + self.constant
 
     @property
     def size(self) -> int:
