@@ -47,7 +47,7 @@ def fitted(name: str, data: Dataset, quick: bool) -> Model:
     """With 16 bases where a method has some; for a look, trained for a moment, which changes no cost unless a gate shuts."""
     options: dict[str, Any] = {} if name in WITHOUT_BASES else {"bases": 8 if quick else 16}
     if quick and issubclass(method_named(name), Learned):
-        options["steps"] = 100
+        options["settings"] = {"steps": 100}
     return ddprt.fit(data, name, **options)
 
 

@@ -227,6 +227,20 @@ def test_both_sides_of_a_seam_are_decoded_to_the_same(tmp_path: Path, docs: dict
     assert gaps[True] < 0.1 * gaps[False]
 
 
+def test_a_map_that_no_point_saw_is_never_the_nearest(tmp_path: Path, docs: dict[str, Any]) -> None:
+    """Light at a point that all maps have dark is equally far from all of them: the first one that is lit answers."""
+    relighter = relighters(8, 3)["nearest"]
+    model = model_of(replace(relighter, values=relighter.values.at[:, 0].set(0).at[0, :, 1].set(0)))
+    one = exported(tmp_path, model, precision="float")
+    values = np.zeros((POINTS, 3))
+    values[0] = 2
+    rows = Frames.read(tmp_path).rows({"values": values})
+    np.testing.assert_array_equal(rows[0, :3], [0, 1, 0])
+    np.testing.assert_array_equal(rows, docs["frame"](tmp_path, values))
+    image = docs["light"](tmp_path, rows)[model.covered]
+    np.testing.assert_allclose(image, one.held.predict(values), rtol=0, atol=one.tolerance)
+
+
 def test_no_light_is_black_and_no_trouble(made: Callable[[str, str], Exported], docs: dict[str, Any]) -> None:
     dark = np.zeros((POINTS, 3))
     for kind in ("set", "decoder", "nearest", "perceptron"):

@@ -19,9 +19,10 @@ _TOWARDS = np.array([0.36, 0.8, 0.48])
 
 
 def example_values(model: Model) -> Float[np.ndarray, "points 3"]:
-    """Measured light that is made up: a bright side, a dark side, another colour on each, W/m²."""
+    """Measured light that is made up: a bright side, a dark side of another colour, and neighbours that differ, W/m²."""
     facing = np.maximum(model.samples.normal[: model.points] @ _TOWARDS, 0)
-    return (np.array([0.2, 0.3, 0.4]) + facing[:, None] * [3.0, 2.0, 1.0]).astype(np.float32)
+    uneven = 1 + 0.2 * (np.arange(model.points) % 4)
+    return (uneven[:, None] * (np.array([0.2, 0.3, 0.4]) + facing[:, None] * [3.0, 2.0, 1.0])).astype(np.float32)
 
 
 def golden(model: Model, found: Deployment, frames: Frames, folder: Path) -> dict[str, Any]:
