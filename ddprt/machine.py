@@ -4,6 +4,7 @@ import hashlib
 import os
 import platform
 import subprocess
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,7 @@ def instruction_set() -> str:
     return hashlib.sha256("\n".join([platform.machine(), *kinds]).encode()).hexdigest()[:8]
 
 
+@cache
 def installed(package: str) -> str | None:
     """Version of an installed package, None where it is missing."""
     try:

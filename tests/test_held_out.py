@@ -19,7 +19,7 @@ from ddprt.bench.tune.fitted import Fitted
 from ddprt.bench.tune.held_out import HeldOut, error_of, spread_of
 from ddprt.bench.tune.planner import Plan, Planner
 from ddprt.bench.tune.search import Search
-from ddprt.bench.tune.suspects import draw_candidates, measured, unknown
+from ddprt.bench.tune.suspects import draw_candidates, unknown
 from ddprt.config import Config
 from ddprt.lights import lighting_json, parse_lighting
 from ddprt.progress import Progress
@@ -107,11 +107,10 @@ def test_errors_are_pooled_over_all_of_them_by_what_each_counts_for(workshop: Wo
     # Four drawn evenly and four by a density: each counts 8 / (4 + 4 d), d by what the model's own points measure.
     candidates = [parse_lighting(each) for each in json.loads(next(workshop.folder.glob("*-candidates/*s.json")).read_text())]
     known = data.values(data.split("train"), model.points, model.quantity)
-    average = unknown(np.stack([model.measure(each) for each in candidates]), known).mean()
+    average = unknown(model.measure_all(candidates), known).mean()
     yardsticks = workshop.yardstick, held_out._more[0]
     lightings = [each.data.lightings[index] for each in yardsticks for index in each.held_out]
-    np.testing.assert_array_equal(measured(model, candidates), np.stack([model.measure(each) for each in candidates]))
-    density = 0.2 + 0.8 * unknown(np.stack([model.measure(each) for each in lightings]), known) / average
+    density = 0.2 + 0.8 * unknown(model.measure_all(lightings), known) / average
     weight = 8 / (4 + 4 * density)
     assert tally.error == pytest.approx(weight * np.concatenate([few.error, other.error]), rel=1e-6)
     mean = (weight[:, None] * np.concatenate([few.mean, other.mean])).mean()

@@ -44,6 +44,13 @@ def test_relight_measures_what_the_dataset_measured(model: Model, data: Dataset)
         np.testing.assert_array_equal(model.measure(data.lightings[index]), data.values([index], 16, "radiosity")[0])
 
 
+def test_many_lightings_measure_as_each_does(model: Model, data: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ddprt.runtime.model._AT_ONCE", 4)
+    lightings = data.lightings[:9]
+    np.testing.assert_array_equal(model.measure_all(lightings), data.values(range(9), 16, "radiosity"))
+    assert model.measure_all([]).shape == (0, 16, 3)
+
+
 def test_relight_is_an_image_with_row_zero_on_top(model: Model, data: Dataset) -> None:
     lighting = data.lightings[data.split("test")[0]]
     image = model.relight(lighting)

@@ -187,14 +187,15 @@ def test_maps_are_held_a_few_at_a_time(yardstick: Yardstick, models: dict[str, M
 
 
 def test_points_are_measured_once(yardstick: Yardstick, models: dict[str, Model], monkeypatch: pytest.MonkeyPatch) -> None:
-    calls: list[int] = []
-    measure = Model.measure
-    monkeypatch.setattr(Model, "measure", lambda self, lighting: (calls.append(self.points), measure(self, lighting))[1])
+    calls: list[tuple[int, int]] = []
+    measure = Model.measure_all
+    record = lambda self, lightings: (calls.append((self.points, len(lightings))), measure(self, lightings))[1]  # noqa: E731
+    monkeypatch.setattr(Model, "measure_all", record)
     fresh = Yardstick(yardstick.scene, yardstick.data, yardstick.frames)
     first, second = models["svd-ridge"], models["mean"]
     fewer = replace(first, points=12)
     assert fresh.measured(first) is fresh.measured(second)
-    assert calls == [24] * 8
+    assert calls == [(24, 8)]
     assert fresh.measured(fewer).shape == (8, 12, 3)
     irradiance = replace(first, quantity="irradiance")
     assert not np.array_equal(fresh.measured(irradiance), fresh.measured(first))

@@ -25,6 +25,7 @@ from ddprt.sampling.points import Samples
 from ddprt.scene.holes import Holes
 
 _LARGEST = float(np.finfo(np.float32).max)
+_AT_ONCE = 64  # lightings whose samples are averaged into points together
 _NOT_FINITE = "values: got NaN or infinity in float32, expected finite W/m²; check how the points are shaded"
 
 
@@ -169,12 +170,24 @@ class Model:
 
     def measure(self, lighting: Lighting | Light | Sequence[dict[str, Any]] | dict[str, Any]) -> np.ndarray:
         """(points, 3) float32: direct light at the points with shadow rays, W/m², as `predict` takes it."""
+        return self.measure_all([lighting])[0]
+
+    def measure_all(self, lightings: Sequence[Any]) -> np.ndarray:
+        """(lightings, points, 3) float32: `measure` of each, on all cores; the same bits."""
         from ddprt.transport.measure import measure
 
-        parsed = parse_lighting(lighting)
         samples = self.samples
-        irradiance = measure(self._tracer, parsed, samples.position, samples.normal, seed=0, depth=samples.depth)
-        return average_into_points(irradiance[None], self.samples, self.points, self.quantity)[0]
+
+        def work(lighting: Any) -> np.ndarray:
+            return measure(
+                self._tracer, parse_lighting(lighting), samples.position, samples.normal, seed=0, depth=samples.depth
+            )
+
+        found = [np.zeros((0, self.points, 3), np.float32)]
+        for first in range(0, len(lightings), _AT_ONCE):
+            light = np.stack(list(self._tracer.map(work, lightings[first : first + _AT_ONCE])))
+            found.append(average_into_points(light, samples, self.points, self.quantity))
+        return np.concatenate(found)
 
     def relight(
         self, lighting: Lighting | Light | Sequence[dict[str, Any]] | dict[str, Any], *, constant: bool = True

@@ -226,7 +226,7 @@ class Yardstick:
         key = model.samples.digest, model.samples.spacing, model.points, model.quantity
         if key not in self._measured:
             indices = [*self.held_out, *self.path]
-            self._measured[key] = np.stack([model.measure(self.data.lightings[index]) for index in indices])
+            self._measured[key] = model.measure_all([self.data.lightings[index] for index in indices])
         return self._measured[key]
 
     def _truth(self, index: int) -> Truth:

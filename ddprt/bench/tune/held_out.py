@@ -21,7 +21,7 @@ from ddprt.bench.measure.trial import Workshop, measured_here
 from ddprt.bench.measure.trial import environment as here
 from ddprt.bench.measure.yardstick import Yardstick, make_yardstick
 from ddprt.bench.tune.fitted import Fitted
-from ddprt.bench.tune.suspects import Suspects, balanced, draw_candidates, measured
+from ddprt.bench.tune.suspects import Suspects, balanced, draw_candidates
 from ddprt.errors import UserError
 from ddprt.files import make_folder, read_tensors, write_tensors, write_text
 from ddprt.lights import Lighting, lighting_json, parse_lighting
@@ -147,7 +147,7 @@ class HeldOut:
         if path.is_file():
             values = read_tensors(path)["values"]
         else:
-            values = measured(model, lightings)
+            values = model.measure_all(lightings)
             make_folder(folder)
             write_tensors(path, {"values": values})
         self.seconds += _took(folder, time.perf_counter() - begun)

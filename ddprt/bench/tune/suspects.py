@@ -19,22 +19,20 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ddprt import seeds
-from ddprt.axes import Float, Float32, Float64
+from ddprt.axes import Float, Float64
 from ddprt.config import Config
 from ddprt.dataset.splits import choose_lightings
-from ddprt.dataset.store import Dataset, average_into_points
+from ddprt.dataset.store import Dataset
 from ddprt.lights import Lighting
 from ddprt.report.metrics import Tally
 from ddprt.runtime.model import Model
 from ddprt.sampling.design import RIDGE
 from ddprt.scene.mesh import Scene
 from ddprt.transport.embree import Tracer
-from ddprt.transport.measure import measure
 
 CANDIDATES = 1024
 """Lightings that are measured, to draw from and to tell what the density integrates to."""
 _EVENLY = 0.2  # share that is drawn whatever a measurement says
-_AT_ONCE = 64  # lightings whose samples are averaged into points together
 
 
 @threadpool_limits.wrap(limits=1, user_api="blas")  # the last bits of a product depend on how many threads it has
@@ -87,7 +85,7 @@ class Suspects:
           model: fitted to `data`.
           data: whose training lightings the model knows.
           lightings: the candidates, see `draw_candidates`.
-          values: what the model's points measure under them, see `measured`.
+          values: what the model's points measure under them, see `Model.measure_all`.
         """
         trained = data.values(data.split("train"), model.points, model.quantity)
         told = unknown(values, trained)
@@ -114,20 +112,6 @@ class Suspects:
         """How far off the logarithm of a pooled error is since `mean` is that of so many candidates, not of all."""
         part = (self.density - _EVENLY) / (1 - _EVENLY)
         return float(np.sqrt(part.var() / len(part)) / 2)
-
-
-def measured(model: Model, lightings: list[Lighting]) -> Float32[np.ndarray, "lightings points 3"]:
-    """What a model's points measure, W/m²: the bits of `Model.measure`, for which samples look for their points each time."""
-    tracer, samples = Tracer(model.occluders, holes=model.holes), model.samples
-
-    def work(lighting: Lighting) -> Float32[np.ndarray, "samples 3"]:
-        return measure(tracer, lighting, samples.position, samples.normal, seed=0, depth=samples.depth)
-
-    found = []
-    for first in range(0, len(lightings), _AT_ONCE):
-        light = np.stack(list(tracer.map(work, lightings[first : first + _AT_ONCE])))
-        found.append(average_into_points(light, samples, model.points, model.quantity))
-    return np.concatenate(found)
 
 
 def draw_candidates(scene: Scene, config: Config, count: int = CANDIDATES) -> list[Lighting]:
