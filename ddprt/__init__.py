@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from ddprt.dataset.store import open_dataset as open_dataset
     from ddprt.errors import UserError as UserError
     from ddprt.lights import load_lightings as load_lightings
+    from ddprt.lights import scene_lights as scene_lights
     from ddprt.methods import METHODS as METHODS
     from ddprt.runtime.model_file import load_model as load_model
     from ddprt.runtime.train import fit as fit
@@ -42,6 +43,7 @@ _HOMES = {
     "load_scene": "ddprt.scene.files",
     "open_dataset": "ddprt.dataset.store",
     "plan": "ddprt.transport.effects",
+    "scene_lights": "ddprt.lights",
 }
 __all__ = ["__version__", *sorted(_HOMES)]
 

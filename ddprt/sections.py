@@ -35,6 +35,9 @@ class AtlasConfig(Section):
 
     resolution: int = Field(256, ge=8, le=8192, description="texels per side, met exactly")
     padding: int = Field(2, ge=1, le=64, description="empty texels between charts")
+    use: Literal["auto", "own", "new"] = Field(
+        "auto", description="own: the file's second texture coordinates; new: xatlas; auto: own where there are sound ones"
+    )
 
 
 class LightingsConfig(Section):
@@ -43,7 +46,12 @@ class LightingsConfig(Section):
     train: int = Field(128, ge=1, description="lightings to learn from")
     validation: int = Field(16, ge=1, description="lightings that learned methods stop early on")
     test: int = Field(32, ge=1, description="held-out lightings that every score is computed on")
-    file: str = Field("", description="JSON list of lightings to use; split in the order train, validation, test")
+    file: str = Field(
+        "", description="JSON list of lightings, or glTF whose lights are one each; split in the order train, validation, test"
+    )
+    gltf_units: Literal["photometric", "radiometric"] = Field(
+        "photometric", description="of lights in glTF: candela and lux, 683 lm a watt; or W/sr and W/m² as they stand"
+    )
     choose: Literal["random", "active"] = Field(
         "random", description="train: as drawn; or those of many candidates whose measurements are least like the others'"
     )

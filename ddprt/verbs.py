@@ -196,7 +196,7 @@ def relight(call: Call) -> None:
     """turn a lighting into an indirect lightmap: ddprt relight MODEL --lighting lights.json --out relit.exr"""
     import json
 
-    from ddprt.lights import load_lightings, parse_lighting
+    from ddprt.lights import load_lightings, parse_lighting, scene_lights
     from ddprt.methods.method import STATUSES
     from ddprt.runtime.model_file import load_model
     from ddprt.scene.exr import write_exr
@@ -218,6 +218,8 @@ def relight(call: Call) -> None:
             raise UserError(
                 f'--lighting: got text that is not JSON ({error}), expected [{{"type": "point", ...}}] or the like; mend it'
             ) from None
+    elif Path(source).suffix.lower() in (".glb", ".gltf"):
+        lightings = [scene_lights(source)]
     else:
         lightings = load_lightings(source)
     for index, lighting in enumerate(lightings):
@@ -246,6 +248,31 @@ def export(call: Call) -> None:
     job = call.run()
     job.export(load_model(job.folder / "model.ddprt"))
     print(f"textures: {job.folder / 'export'}")
+
+
+def view(call: Call) -> None:
+    """show a model in the browser, lamps to be dragged: ddprt view MODEL, or --html FILE.html for a page of its own"""
+    from ddprt.dataset.store import open_dataset
+    from ddprt.export.viewer.pack import pack
+    from ddprt.export.viewer.page import page
+    from ddprt.export.viewer.serve import serve
+    from ddprt.files import write_text
+    from ddprt.runtime.model_file import load_model
+
+    out, port = call.options.get("html"), call.options.get("port", "0")
+    if out is not None and Path(out).suffix not in (".html", ".htm"):
+        raise UserError(f"--html: got {out}, expected a path that ends in .html; name it so")
+    if not (port.isascii() and port.isdigit() and int(port) < 1 << 16):
+        raise UserError(f"--port: got {port}, expected a whole number from 0 to 65535; 0 takes a free one")
+    folder = Path(call.file("a model folder such as runs/cornell/model.ddprt"))
+    model = load_model(folder / "model.ddprt" if (folder / "model.ddprt").is_dir() else folder)
+    data = open_dataset(call.options["dataset"]) if call.asks("dataset") else None
+    made = page(pack(model, data))
+    if out is None:
+        serve(made, int(port), browse=not call.asks("no-open"))
+        return
+    write_text(Path(out), made)
+    print(f"viewer:   {out}")
 
 
 def verify(call: Call) -> None:
@@ -324,7 +351,18 @@ VERBS = {
         configured=False,
     ),
     "export": Verb(export, options=_OUT),
+    "view": Verb(
+        view,
+        "MODEL",
+        {
+            "html": "FILE.html  write one file that opens from disk, and serve nothing",
+            "dataset": "DIR  held-out lightings with their references and errors",
+            "port": "N  of the address on this machine (default: a free one)",
+        },
+        {"no-open": "open no browser"},
+        configured=False,
+    ),
     "verify": Verb(verify, "DIR", configured=False),
     "doctor": Verb(doctor, "", configured=False),
 }
-LATER = {"import", "view", "status"}
+LATER = {"import", "status"}

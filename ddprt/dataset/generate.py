@@ -29,6 +29,7 @@ from ddprt.progress import Progress
 from ddprt.sampling.points import Samples, load_samples, place_samples
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
+from ddprt.scene.own_charts import charted
 from ddprt.sections import PointsConfig
 from ddprt.transport.direct import Texels
 from ddprt.transport.effects import Plan, plan
@@ -140,6 +141,7 @@ class _Bake:
     """One bake from start to end; every stage skips what the manifest already holds."""
 
     def __init__(self, scene: Scene, config: Config, folder: Path, progress: Progress, first: int | None, once: Once) -> None:
+        scene = charted(scene, config.atlas.use, config.atlas.resolution, config.atlas.padding)
         self.scene, self.config, self.folder, self.progress, self.first = scene, config, folder, progress, first
         once.bind(scene.digest, config.model_dump_json(include={"seed", "atlas", "lightings", "points"}))
         self.tracer, self.once = Tracer.of(scene, config.transport.threads), once
@@ -170,6 +172,7 @@ class _Bake:
         with self.progress.stage("atlas") as stage:
             size = self.config.atlas
             atlas, hidden = build_open_atlas(self.tracer, scattering(self.scene), size.resolution, size.padding)
+            stage.facts |= {} if self.scene.lightmap is None else {"charts": "the file's own"}
             stage.facts |= {"texels": atlas.count, "texels_per_metre": float(f"{atlas.texels_per_metre:.4g}"), **hidden}
         with self.progress.stage("points") as stage:
             samples = listed or self._sunk(self._placed(atlas), lightings)

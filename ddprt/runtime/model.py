@@ -51,6 +51,7 @@ class Model:
       constant: irradiance of emissive surfaces, which no light changes, W/m²; None where nothing glows.
       exitant: covered texels whose light is all that leaves them, to which no diffuse reflection of lamps comes; None where
         there are none.
+      albedo: of the covered texels, linear, to show them by; no answer depends on it. None in models of older versions.
     """
 
     method: str
@@ -69,6 +70,7 @@ class Model:
     holes: Holes | None = None
     constant: np.ndarray | None = None
     exitant: np.ndarray | None = None
+    albedo: np.ndarray | None = None
 
     def predict(
         self,

@@ -98,6 +98,8 @@ def save_model(model: Model, folder: Path) -> None:
         tensors["light.constant"] = model.constant
     if model.exitant is not None:
         tensors["atlas.exitant"] = model.exitant
+    if model.albedo is not None:
+        tensors["atlas.albedo"] = model.albedo
     trust: dict[str, float] = {}
     if model.yardstick is not None:
         for entry in fields(model.yardstick):
@@ -225,6 +227,9 @@ def _assemble(
     exitant = tensors.get("atlas.exitant")
     if exitant is not None and exitant.shape != (int(tensors["atlas.covered"].sum()),):
         raise ValueError(f"got exitant texels of shape {exitant.shape}")
+    paint = tensors.get("atlas.albedo")
+    if paint is not None and paint.shape != (int(tensors["atlas.covered"].sum()), 3):
+        raise ValueError(f"got albedo of shape {paint.shape}")
     position, normal, albedo = (tensors[f"points.{name}"] for name in ("position", "normal", "albedo"))
     samples = Samples(position, normal, albedo, places.spacing, places.depth)
     return Model(
@@ -244,6 +249,7 @@ def _assemble(
         Holes.read(tensors, len(tensors["scene.corners"])),
         constant,
         exitant,
+        paint,
     )
 
 

@@ -138,6 +138,7 @@ def fit_method(
         None if isinstance(data, LayerData) else data.holes,
         data.constant,
         None if isinstance(data, LayerData) else data.exitant,
+        None if isinstance(data, LayerData) else data.gbuffer["albedo"],
     )
 
 

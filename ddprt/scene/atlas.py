@@ -185,7 +185,7 @@ class Atlas:
       albedo: area-weighted mean, linear.
       area: m²; sums to the area of the mesh, or to what of it is in the open (see `transport.openness`).
       coverage: share of the texel's square that is covered.
-      chart: xatlas chart; where walls stand on one, each region that they bound has its own number.
+      chart: of xatlas or of the file; where walls stand on one, each region that they bound has its own number.
       centre: of the scene; `sampler` works relative to it, so that float32 suffices.
       parted: texels that lie on both sides of a wall, and belong to one of them.
       part: which texel's light lies on each small square of those; -1 for none, where a square touches the wall itself.

@@ -37,6 +37,8 @@ def checked(
     material: np.ndarray | None = None,
     materials: tuple[Material, ...] = (Material("plain", (UNSAID,) * 3),),
     uv: np.ndarray | None = None,
+    colour: np.ndarray | None = None,
+    lightmap: np.ndarray | None = None,
     notes: tuple[str, ...] = (),
 ) -> Scene:
     """Check raw arrays, mend what can be mended and make a `Scene` of them.
@@ -49,6 +51,8 @@ def checked(
       material: index into `materials` per triangle; all 0 if left out.
       materials: albedo and texture, each 0 to 1, linear.
       uv: (vertices, 2) texture coordinates, origin top-left; needed where a material has a texture.
+      colour: (vertices, 3) linear factors on the albedo, 0 to 1; 1 if left out.
+      lightmap: (vertices, 2) places on a lightmap of the file's own, NaN where it has none; judged when a scene is unwrapped.
       notes: what an importer has to say already.
     Returns:
       The scene; `notes` lists the repairs after those given.
@@ -72,6 +76,12 @@ def checked(
     if uv is not None:
         uv = np.asarray(_table(name, "uv", uv, 2, len(positions)), dtype=np.float64)
         _finite(name, "texture coordinate", uv, triangles)
+    if colour is not None:
+        colour = np.asarray(_table(name, "colour", colour, 3, len(positions)), dtype=np.float64)
+        if not ((colour >= 0) & (colour <= 1))[triangles].all():
+            raise UserError(f"{name}: got vertex colours that are not 0 to 1, expected linear factors; correct them")
+    if lightmap is not None:
+        lightmap = np.asarray(_table(name, "lightmap", lightmap, 2, len(positions)), dtype=np.float64)
 
     found = list(notes)
     triangles = triangles.astype(np.int64)
@@ -103,7 +113,8 @@ def checked(
     triangles = triangles.reshape(-1, 3)
     if dropped := len(positions) - len(used):
         found.append(f"{dropped} vertices of no triangle dropped")
-    positions, uv = positions[used], None if uv is None else uv[used]
+    positions = positions[used]
+    uv, colour, lightmap = (None if rows is None else rows[used] for rows in (uv, colour, lightmap))
     given = None if normals is None else np.asarray(_table(name, "normals", normals, 3, len(weld)), dtype=np.float64)[used]
     unit, remark = _shading(positions, triangles, given)
     backs = _open_backs(weld[used][triangles], np.array([entry.two_sided for entry in materials])[material])
@@ -111,7 +122,7 @@ def checked(
         first = len(positions)
         own, corner = np.unique(triangles[backs], return_inverse=True)
         positions, unit = np.concatenate([positions, positions[own]]), np.concatenate([unit, -unit[own]])
-        uv = None if uv is None else np.concatenate([uv, uv[own]])
+        uv, colour, lightmap = (None if rows is None else np.concatenate([rows, rows[own]]) for rows in (uv, colour, lightmap))
         triangles = np.concatenate([triangles, first + corner.reshape(-1, 3)[:, ::-1]])
         material = np.concatenate([material, material[backs]])
         remark.append(f"{len(backs)} triangles of two-sided materials have a back of their own")
@@ -124,6 +135,8 @@ def checked(
         tuple(materials),
         uv,
         (*found, *remark),
+        colour=colour,
+        lightmap=lightmap,
     )
 
 

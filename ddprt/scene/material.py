@@ -3,8 +3,10 @@
 So a scene says by itself which effects it calls for: one without a `Cutout` has no holes to look for.
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -157,6 +159,16 @@ class Material:
         found = {"albedo": self.texture, **{name: part.texture for name, part in parts if part}}
         found |= {"opacity": self.cutout.opacity} if self.cutout else {}
         return {name: image for name, image in found.items() if image is not None}
+
+    def retextured(self, images: Mapping[str, np.ndarray]) -> "Material":
+        """The same with other images, by the names of `textures`."""
+        lit = {"emission": self.emission, "gloss": self.gloss}
+        changed: dict[str, Any] = {
+            name: replace(part, texture=images[name]) for name, part in lit.items() if part and name in images
+        }
+        if self.cutout:
+            changed["cutout"] = replace(self.cutout, opacity=images["opacity"])
+        return replace(self, texture=images.get("albedo"), **changed)
 
 
 def bilinear(image: Float[np.ndarray, "height width ..."], uv: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n ..."]:

@@ -59,6 +59,8 @@ class Scene:
       forced: effects that a user wants simulated whatever the materials say.
       refused: effects that a user wants left out likewise.
       tubes: strands, of which the last triangles are; None where there are none.
+      colour: linear factor on the albedo per vertex, 0 to 1, or None where it is 1 everywhere.
+      lightmap: where the file would have each vertex on a lightmap, unchecked; see `ddprt.scene.own_charts`.
     """
 
     name: str
@@ -73,6 +75,8 @@ class Scene:
     forced: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
     tubes: Tubes | None = None
+    colour: Float64[np.ndarray, "vertices 3"] | None = None
+    lightmap: Float64[np.ndarray, "vertices 2"] | None = None
 
     @cached_property
     def corners(self) -> Float64[np.ndarray, "triangles 3 3"]:
@@ -117,6 +121,9 @@ class Scene:
         for array in [*arrays, *(material.texture for material in self.materials)]:
             if array is not None:
                 state.update(str(array.shape).encode() + np.ascontiguousarray(array).tobytes())
+        for name, rows in (("colour", self.colour), ("lightmap", self.lightmap)):
+            if rows is not None:
+                state.update(f"{name} {rows.shape}".encode() + np.ascontiguousarray(rows).tobytes())
         state.update(repr([material.albedo for material in self.materials]).encode())
         for index, material in enumerate(self.materials):
             for part in (material.cutout, material.emission, material.gloss, material.subsurface, material.fibre):
@@ -150,6 +157,8 @@ class Scene:
         """Linear albedo at points given by triangle and weights of its three corners."""
         material = self.material[triangle]
         albedo = np.array([entry.albedo for entry in self.materials])[material]
+        if self.colour is not None:
+            albedo *= np.einsum("nc,ncd->nd", barycentric, self.colour[self.triangles[triangle]])
         if self.uv is None:
             return albedo
         uv = self.uv_at(triangle, barycentric)

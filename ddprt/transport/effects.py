@@ -21,6 +21,7 @@ from ddprt.scene.files import load_scene
 from ddprt.scene.holes import pierced
 from ddprt.scene.material import Material
 from ddprt.scene.mesh import Scene
+from ddprt.scene.own_charts import charted
 from ddprt.scene.sheets import backs, without_backs
 from ddprt.sections import TransportConfig
 from ddprt.transport.glossiness import glossy, lobe_left, worth_gloss
@@ -204,8 +205,9 @@ def force(scene: Scene, *, on: Sequence[str] = (), off: Sequence[str] = ()) -> S
 
 
 def configured_scene(config: Config) -> Scene:
-    """The scene of a configuration, with the effects that it forces."""
-    return force(load_scene(config.scene.name, **config.scene.parameters), on=config.effects.on, off=config.effects.off)
+    """The scene of a configuration, with the effects that it forces and the lightmap layout that it takes."""
+    scene = force(load_scene(config.scene.name, **config.scene.parameters), on=config.effects.on, off=config.effects.off)
+    return charted(scene, config.atlas.use, config.atlas.resolution, config.atlas.padding)
 
 
 def _decided(name: str, entry: Entry, question: Question) -> Effect:

@@ -104,8 +104,9 @@ class Meetings(Protocol):
 
 
 def albedo_of(scene: Scene) -> Albedo:
-    """A table where triangles have one colour each, the scene's textures where not."""
-    if scene.uv is not None and any(material.texture is not None for material in scene.materials):
+    """A table where triangles have one colour each, the scene's textures and colours of vertices where not."""
+    textured = scene.uv is not None and any(material.texture is not None for material in scene.materials)
+    if textured or scene.colour is not None:
         return lambda triangle, u, v: scene.albedo_at(triangle, np.stack([1 - u - v, u, v], 1)).astype(np.float32)
     table = np.array([entry.albedo for entry in scene.materials], np.float32)[scene.material]
     return lambda triangle, u, v: np.take(table, triangle, axis=0, mode="wrap")
