@@ -247,11 +247,11 @@ class Run:
 
     def export(self, model: Any) -> list[Path]:
         """Writes what engines load."""
+        from ddprt.export.deployed import export_model
         from ddprt.export.layers import export_layers
-        from ddprt.export.textures import export_textures
 
         with self.progress.stage("export"):
-            files = export_textures(model, self.folder / "export", **self.config.export.model_dump())
+            files = export_model(model, self.folder / "export", **self.config.export.model_dump())
             export_layers(model, self.folder / "export")
         seams = json.loads(files[-1].read_text())["seams"]
         if self.config.export.stitch and not seams["stitched"]:
@@ -302,13 +302,18 @@ class Run:
         return [] if data.imported else _effects(self.effects(data), self.progress.stages, data)
 
     def all(self) -> dict[str, Path]:
-        """Everything, and where it is."""
+        """Everything, and where it is; no textures where the method does not say how it is deployed."""
+        from ddprt.runtime.deployment import refusal
+
         data = self.bake()
         models, seconds = self.fit(data)
         evaluation = self.evaluate(data, models, seconds)
         report = self.report(data, models, evaluation)
         main = next(iter(models.values()))
-        exported = self.export(main) if main.method == "svd-ridge" else []
+        left_out = refusal(main)
+        if left_out:
+            self.progress.warn(left_out)
+        exported = [] if left_out else self.export(main)
         self.record(data)
         return {
             "report": report,

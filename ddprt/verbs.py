@@ -144,7 +144,7 @@ def tune(call: Call) -> None:
 
 
 def export(call: Call) -> None:
-    """write basis textures, matrices and a manifest for engines"""
+    """write textures, matrices or a network, a shader and a manifest for engines"""
     from ddprt.runtime.animated_file import is_animated, load_animated
     from ddprt.runtime.model_file import load_model
 
