@@ -3,8 +3,9 @@ PYTHON ?= python3.11
 BIN := .venv/bin
 WORKERS ?= 2
 READY := .venv/.ready
+VIEWER := ddprt/export/viewer
 
-.PHONY: cornell test test-slow check format lock clean
+.PHONY: cornell test test-slow check format lock viewer clean
 
 cornell: $(READY)
 	$(BIN)/ddprt run configs/cornell.toml --out runs/cornell
@@ -35,8 +36,15 @@ $(READY): requirements.lock pyproject.toml
 
 # Needs uv; writes no addresses into the lock.
 lock:
-	uv pip compile pyproject.toml --extra test --extra reference --extra denoise --extra flip --extra dev --universal --python-version 3.11 --generate-hashes \
+	uv pip compile pyproject.toml --extra test --extra reference --extra denoise --extra flip --extra textures --extra dev --universal --python-version 3.11 --generate-hashes \
 	  --no-emit-index-url --no-emit-find-links --no-annotate --no-header --output-file requirements.lock
+
+# Needs Node 20 or later and npm; users need neither, for the bundle is committed. Built apart, so that no package is shipped.
+viewer:
+	rm -rf .cache/viewer && mkdir -p .cache/viewer
+	cp -r $(VIEWER)/src $(VIEWER)/package.json $(VIEWER)/build.mjs .cache/viewer
+	cd .cache/viewer && npm install --no-audit --no-fund && npm run build
+	cp .cache/viewer/viewer.js $(VIEWER)/viewer.js
 
 clean:
 	rm -rf .venv runs .pytest_cache .mypy_cache .ruff_cache .hypothesis

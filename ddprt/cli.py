@@ -15,9 +15,10 @@ from contextlib import contextmanager, suppress
 from typing import Any, NoReturn
 
 from ddprt import __version__
+from ddprt.call import Call
 from ddprt.errors import UserError, nearest
 from ddprt.progress import Doubt
-from ddprt.verbs import LATER, VERBS, Call
+from ddprt.verbs import LATER, VERBS
 
 REPORT_ISSUE = "this is our fault: run again with --debug and report what it prints"
 _AGAIN = 0.02  # seconds until a dropped interrupt is asked for again

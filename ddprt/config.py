@@ -16,6 +16,7 @@ from pydantic import BaseModel, Field, ValidationError, field_validator
 from ddprt.errors import UserError, nearest, spoken
 from ddprt.errors import explain as explained
 from ddprt.sections import (
+    AnimationConfig,
     AtlasConfig,
     BenchConfig,
     BudgetConfig,
@@ -40,6 +41,7 @@ class Config(Section):
 
     seed: int = Field(0, ge=0, le=2**32 - 1, description="every random number follows from it")
     scene: SceneConfig = SceneConfig()
+    animation: AnimationConfig = AnimationConfig()
     atlas: AtlasConfig = AtlasConfig()
     lightings: LightingsConfig = LightingsConfig()
     points: PointsConfig = PointsConfig()
@@ -74,6 +76,11 @@ class Config(Section):
             if not isinstance(values, list | tuple) or not values:
                 raise ValueError(f"{key}: got {values!r}, expected a list of at least one value; write {_listed(key, values)}")
         return knobs
+
+    @property
+    def animated(self) -> bool:
+        """Whether keyframes are asked for."""
+        return bool(self.animation.keys) or bool(self.scene.poses)
 
     def to_toml(self) -> str:
         """The resolved configuration as TOML, accepted as input again."""

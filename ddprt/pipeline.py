@@ -14,14 +14,17 @@ from ddprt.config import Config
 from ddprt.dataset.forecast import Forecast, forecast
 from ddprt.dataset.forecast_effects import belongs
 from ddprt.dataset.generate import bake
+from ddprt.dataset.importers.places import stored_scene
 from ddprt.dataset.sameness import check_skies, other_settings
 from ddprt.dataset.store import Dataset, open_dataset
 from ddprt.errors import UserError
 from ddprt.files import make_folder, write_text
 from ddprt.machine import machine, peak_memory_gib
 from ddprt.progress import Progress
+from ddprt.scene.files import IMPORTED
 from ddprt.scene.mesh import Scene
-from ddprt.transport.effects import Plan, configured_scene, plan
+from ddprt.transport.configured import configured_scene
+from ddprt.transport.effects import Plan, plan
 from ddprt.transport.glossiness import valid_integrator
 
 _AFTER_BAKE = ("fit", "evaluate", "bases curve", "spot check", "report", "export")
@@ -60,6 +63,10 @@ class Run:
 
         check_names(self.config)
         self._check_views()
+        if self.config.export.formats != ("exr",) and self.config.fit.method == "svd-ridge":
+            from ddprt.export.formats.listing import check_formats
+
+            check_formats(self.config.export.formats, self.config.atlas.resolution, self.config.atlas.resolution)
 
     def _check_views(self) -> None:
         if self.config.report.views:
@@ -68,7 +75,12 @@ class Run:
             check_eyes(self.scene, self.config.report.views, layers=self.config.effects.glossy_layers)
 
     def bake(self) -> Dataset:
-        """Bakes (or goes on with, or finds finished) the dataset; writes the resolved configuration."""
+        """Bakes (or goes on with, or finds finished) the dataset; writes the resolved configuration.
+
+        Imported light is taken as it is.
+        """
+        if self.config.scene.name == IMPORTED:
+            return self.dataset()
         self._check()
         scene = self.scene
         make_folder(self.folder)
@@ -110,8 +122,12 @@ class Run:
         """
         if not (self.folder / "dataset" / "dataset.json").is_file():
             raise UserError(f"{self.folder}: got no dataset, expected a run folder; run `ddprt bake` with the same --out first")
-        self._check_views()
         data = open_dataset(self.folder / "dataset")
+        if data.imported and self.config.scene.name == IMPORTED:
+            if self.config.report.views:
+                raise UserError("report.views: got some, but imported light is seen in its maps alone; leave them out")
+            return data
+        self._check_views()
         differs = other_settings(data.description, self.config, self.scene)
         if differs:
             name = data.description["scene"]["name"]
@@ -174,7 +190,7 @@ class Run:
         with self.progress.stage("bases curve"):
             evaluation.curve = bases_curve(data, self.config, evaluation.truth)
         with self.progress.stage("spot check") as stage:
-            evaluation.spot_check = spot_check(self.scene, data, self.config)
+            evaluation.spot_check = {} if data.imported else spot_check(self.scene, data, self.config)
             stage.facts |= {key: evaluation.spot_check[key] for key in ("rays",) if key in evaluation.spot_check}
         summary = {key: value for key, value in evaluation.spot_check.items() if key not in ("baked", "truth", "variance")}
         evaluation.metrics["spot_check"] = summary
@@ -220,7 +236,7 @@ class Run:
                 models=models,
                 config=self.config,
                 stages=self.progress.stages,
-                scene=self.scene,
+                scene=stored_scene(data) if data.imported else self.scene,
                 plan_effects=self.effects(data).effects,
                 effect_costs={str(row["name"]): row for row in self.costs(data)},
                 command=self.command,
@@ -231,16 +247,31 @@ class Run:
 
     def export(self, model: Any) -> list[Path]:
         """Writes what engines load."""
+        from ddprt.export.deployed import export_model
         from ddprt.export.layers import export_layers
-        from ddprt.export.textures import export_textures
 
         with self.progress.stage("export"):
-            files = export_textures(model, self.folder / "export", **self.config.export.model_dump())
+            files = export_model(model, self.folder / "export", **self.config.export.model_dump())
             export_layers(model, self.folder / "export")
         seams = json.loads(files[-1].read_text())["seams"]
         if self.config.export.stitch and not seams["stitched"]:
             self.progress.warn(f"export.stitch: seams stay open: {seams['why']}")
         return files
+
+    def format_table(self, model: Any) -> str:
+        """What every format of textures costs, on held-out lightings where the run has its dataset; also `formats.json`."""
+        from ddprt.export.table import HeldOut, as_json, format_table, told
+
+        held_out = None
+        if (self.folder / "dataset" / "dataset.json").is_file():
+            data = self.dataset()
+            test = data.split("test")
+            held_out = HeldOut(data.values(test, model.points, model.quantity), data.maps("indirect", test))
+        with self.progress.stage("format table"):
+            settings = self.config.export
+            rows = format_table(model, held_out, gutter=settings.gutter, stitch=settings.stitch, refit=settings.refit)
+        write_text(self.folder / "export" / "formats.json", as_json(rows))
+        return told(rows)
 
     def sweep(self) -> list[Path]:
         """Tries settings about the configuration (`ddprt bench`); returns the results and what shows them."""
@@ -261,21 +292,28 @@ class Run:
         return tune(self.config, self.folder / "tune", self.progress)
 
     def effects(self, data: Dataset) -> Plan:
-        """The plan that the dataset was baked under."""
+        """The plan that the dataset was baked under; empty for imported light."""
+        if data.imported:
+            return Plan((), 0)
         return plan(self.scene, data.lightings, bounces=self.config.transport.bounces, probes=self.config.probes.asked)
 
     def costs(self, data: Dataset) -> list[dict[str, Any]]:
         """The plan's effects with their rays, seconds and share of the light."""
-        return _effects(self.effects(data), self.progress.stages, data)
+        return [] if data.imported else _effects(self.effects(data), self.progress.stages, data)
 
     def all(self) -> dict[str, Path]:
-        """Everything, and where it is."""
+        """Everything, and where it is; no textures where the method does not say how it is deployed."""
+        from ddprt.runtime.deployment import refusal
+
         data = self.bake()
         models, seconds = self.fit(data)
         evaluation = self.evaluate(data, models, seconds)
         report = self.report(data, models, evaluation)
         main = next(iter(models.values()))
-        exported = self.export(main) if main.method == "svd-ridge" else []
+        left_out = refusal(main)
+        if left_out:
+            self.progress.warn(left_out)
+        exported = [] if left_out else self.export(main)
         self.record(data)
         return {
             "report": report,

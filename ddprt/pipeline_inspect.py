@@ -24,7 +24,8 @@ def describe(source: str, overrides: dict[str, str]) -> str:
     """
     from ddprt.dataset.generate import check_points
     from ddprt.dataset.sameness import baked_settings
-    from ddprt.transport.effects import configured_scene, plan
+    from ddprt.transport.configured import configured_scene
+    from ddprt.transport.effects import plan
     from ddprt.transport.embree import Tracer
     from ddprt.transport.openness import build_open_atlas
 
@@ -43,10 +44,10 @@ def describe(source: str, overrides: dict[str, str]) -> str:
     ]  # fmt: skip
     tracer = Tracer.of(scene)
     atlas, hidden = build_open_atlas(tracer, scene, config.atlas.resolution, config.atlas.padding)
-    charts = len(np.unique(atlas.chart))
+    charts, of = len(np.unique(atlas.chart)), "" if scene.lightmap is None else " of the file"
     lines.append(
         f"atlas       {atlas.resolution} x {atlas.resolution}: {atlas.count} texels covered "
-        f"({100 * atlas.count / atlas.resolution**2:.0f} %), {charts} charts, {atlas.texels_per_metre:.4g} texels per metre"
+        f"({100 * atlas.count / atlas.resolution**2:.0f} %), {charts} charts{of}, {atlas.texels_per_metre:.4g} texels per metre"
     )
     if any(hidden.values()):
         lines.append("            " + ", ".join(f"{count} {what}" for what, count in hidden.items()) + " by other geometry")
@@ -102,7 +103,7 @@ def _some_lightings(config: Config, scene: Any, tracer: Any) -> tuple[Any, list[
 
     settings = config.lightings
     if settings.file:
-        listed = load_lightings(settings.file)
+        listed = load_lightings(settings.file, settings.gltf_units)
         return listed[:_LOOKED_AT], [
             f"lightings   {settings.file}: {len(listed)}, of which the first {_LOOKED_AT} are looked at"
         ]

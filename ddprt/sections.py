@@ -23,11 +23,52 @@ class Section(BaseModel):
         return str(value).lower() if isinstance(value, bool) else value
 
 
+class FogConfig(Section):
+    """A homogeneous medium that fills the scene's bounding box; see `ddprt.scene.fog`."""
+
+    mean_free_path: tuple[float, ...] = Field((), description="metres per channel, or one number for all; none: no fog")
+    albedo: tuple[float, ...] = Field((1.0,), description="of single scattering, 0 to 1, likewise")
+    anisotropy: float = Field(0.0, description="mean cosine of the angle of scattering, -1 to 1, both excluded")
+
+    @field_validator("mean_free_path", "albedo", mode="before")
+    @classmethod
+    def _of_all_channels(cls, value: Any) -> Any:
+        return [value] if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> "FogConfig":
+        if not self.mean_free_path and self != FogConfig.model_construct():
+            raise ValueError("mean_free_path: got none, expected metres, e.g. [0.5]; add it, or leave [scene.fog] out")
+        return self
+
+    @property
+    def given(self) -> dict[str, Any] | None:
+        """What `load_scene` takes; None for clear air."""
+        return self.model_dump() if self.mean_free_path else None
+
+
 class SceneConfig(Section):
     """What stays still."""
 
     name: str = Field("cornell", description="a name of SCENES, or a path to an .obj, .ply, .stl, .gltf or .glb file")
     parameters: dict[str, float] = Field({}, description="numbers that a scene in code takes, e.g. {albedo = 0.5}")
+    fog: FogConfig = FogConfig()
+    poses: tuple[str, ...] = Field((), description="mesh files of one topology, keyframes of an animation, in place of name")
+
+
+class AnimationConfig(Section):
+    """Keyframes of what moves: none unless they are asked for here, or by scene.poses."""
+
+    keys: Annotated[int, Field(ge=0, le=256)] | tuple[float, ...] = Field(
+        0, description="how many, evenly over the motion, or their times in seconds; 0: the scene stands still"
+    )
+    between: tuple[Annotated[float, Field(gt=0.0, lt=1.0)], ...] = Field(
+        (0.5,), description="shares of the way from key to key at which poses are tested that nobody learned from"
+    )
+    matrices: Literal["one", "each", "both"] = Field(
+        "both", description="transfer matrices: one for all keys, one for each, or both compared and those of each kept"
+    )
+    clip: str = Field("", description="name or number of the animation in a glTF file; empty: the first")
 
 
 class AtlasConfig(Section):
@@ -35,6 +76,9 @@ class AtlasConfig(Section):
 
     resolution: int = Field(256, ge=8, le=8192, description="texels per side, met exactly")
     padding: int = Field(2, ge=1, le=64, description="empty texels between charts")
+    use: Literal["auto", "own", "new"] = Field(
+        "auto", description="own: the file's second texture coordinates; new: xatlas; auto: own where there are sound ones"
+    )
 
 
 class LightingsConfig(Section):
@@ -43,7 +87,12 @@ class LightingsConfig(Section):
     train: int = Field(128, ge=1, description="lightings to learn from")
     validation: int = Field(16, ge=1, description="lightings that learned methods stop early on")
     test: int = Field(32, ge=1, description="held-out lightings that every score is computed on")
-    file: str = Field("", description="JSON list of lightings to use; split in the order train, validation, test")
+    file: str = Field(
+        "", description="JSON list of lightings, or glTF whose lights are one each; split in the order train, validation, test"
+    )
+    gltf_units: Literal["photometric", "radiometric"] = Field(
+        "photometric", description="of lights in glTF: candela and lux, 683 lm a watt; or W/sr and W/m² as they stand"
+    )
     choose: Literal["random", "active"] = Field(
         "random", description="train: as drawn; or those of many candidates whose measurements are least like the others'"
     )
@@ -245,6 +294,18 @@ class ExportConfig(Section):
     precision: Literal["half", "float"] = Field("half", description="of the basis textures")
     gutter: int = Field(4, ge=0, le=64, description="texels that charts are extended by, smoothly")
     stitch: bool = Field(True, description="make charts agree where a smooth surface was cut to be unwrapped")
+    formats: tuple[Literal["exr", "exr-grid", "raw", "ktx2", "bytes", "bc6h", "bc6h-ktx2"], ...] = Field(
+        ("exr",), min_length=1, description="files that basis textures are written to (docs/export.md)"
+    )
+    refit: bool = Field(True, description="fit the transfer to the textures as each format but exr holds them")
+
+    @field_validator("formats")
+    @classmethod
+    def _each_once(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice:
+            raise ValueError(f'got "{twice}" more than once, expected every format once; leave the others out')
+        return names
 
 
 class BenchConfig(Section):

@@ -1,61 +1,12 @@
 """The verbs of the command line: what each does with what was typed. Imports stay inside them, so that help is instant."""
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
+from ddprt.call import Call
 from ddprt.errors import UserError
-
-
-@dataclass
-class Call:
-    """What was typed after the verb."""
-
-    verb: str
-    files: list[str] = field(default_factory=list)
-    options: dict[str, str] = field(default_factory=dict)
-    overrides: dict[str, str] = field(default_factory=dict)
-    command: str = ""
-
-    @property
-    def quiet(self) -> bool:
-        """Whether progress is hidden."""
-        return "quiet" in self.options
-
-    def asks(self, flag: str) -> bool:
-        """Whether a flag was given."""
-        return flag in self.options
-
-    def file(self, what: str) -> str:
-        """The one file argument."""
-        if len(self.files) != 1:
-            raise UserError(f"ddprt {self.verb}: got {len(self.files)} files, expected {what}; see `ddprt {self.verb} --help`")
-        return self.files[0]
-
-    def run(self) -> Any:
-        """The run folder and configuration that the arguments mean."""
-        from ddprt.config import load_config
-        from ddprt.pipeline import Run
-
-        source = self.file("a configuration such as configs/cornell.toml")
-        if _is_scene(source):
-            raise UserError(
-                f"ddprt {self.verb}: got the scene {source}, expected a configuration; "
-                f"write ddprt {self.verb} configs/cornell.toml --scene.name {source}"
-            )
-        config = load_config(source, self.overrides)
-        default = Path(source).parent if Path(source).name == "config.toml" else Path("runs") / Path(source).stem
-        return Run(config, Path(self.options.get("out") or default), command=self.command, quiet=self.quiet)
-
-
-def _is_scene(source: str) -> bool:
-    """Whether a scene stands where a configuration should."""
-    from ddprt.scene.files import SUFFIXES
-    from ddprt.scene.library import SCENES
-
-    return Path(source).suffix.lower() in SUFFIXES or (source in SCENES and not Path(source).is_file())
+from ddprt.verbs_alone import doctor, import_, relight, verify, view
 
 
 def run(call: Call) -> None:
@@ -192,90 +143,18 @@ def tune(call: Call) -> None:
     print(f"config:   {job.folder / 'tune' / 'tuned.toml'}")
 
 
-def relight(call: Call) -> None:
-    """turn a lighting into an indirect lightmap: ddprt relight MODEL --lighting lights.json --out relit.exr"""
-    import json
-
-    from ddprt.lights import load_lightings, parse_lighting
-    from ddprt.methods.method import STATUSES
-    from ddprt.runtime.model_file import load_model
-    from ddprt.scene.exr import write_exr
-
-    source, out = call.options.get("lighting"), Path(call.options.get("out", "relit.exr"))
-    if source is None:
-        raise UserError(
-            'ddprt relight: got no --lighting, expected a JSON file or text such as [{"type": "point", ...}]; add it'
-        )
-    if out.suffix != ".exr":
-        raise UserError(f"--out: got {out}, expected a path that ends in .exr; name it so")
-    model = load_model(call.file("a model folder such as runs/cornell/model.ddprt"))
-    if source.lstrip().startswith(("[", "{")):
-        try:
-            records = json.loads(source)
-            several = isinstance(records, list) and bool(records) and isinstance(records[0], list)
-            lightings = [parse_lighting(entry, "--lighting") for entry in (records if several else [records])]
-        except (json.JSONDecodeError, RecursionError) as error:
-            raise UserError(
-                f'--lighting: got text that is not JSON ({error}), expected [{{"type": "point", ...}}] or the like; mend it'
-            ) from None
-    else:
-        lightings = load_lightings(source)
-    for index, lighting in enumerate(lightings):
-        path = out if len(lightings) == 1 else out.with_stem(f"{out.stem}_{index:03d}")
-        measured = model.measure(lighting)
-        image, trust = model.image(model.predict(measured, lightings=lighting)), model.trust(measured)
-        if not image.any():
-            print(
-                f"warning: lighting {index} lights no measurement point, so {path} is black; its lamps may stand "
-                "inside a solid, outside the scene, face away or have no intensity",
-                file=sys.stderr,
-            )
-        write_exr(path, image)
-        print(f"lightmap: {path}")
-        if trust is None or not measured.any():
-            continue
-        print(f"trust:    {trust.score:.2f}, an expected error of {1 - trust.score:.0%}")
-        if trust.extrapolating:
-            print(f"warning: lighting {index}: extrapolating: {STATUSES['extrapolating']}", file=sys.stderr)
-
-
 def export(call: Call) -> None:
-    """write basis textures, matrices and a manifest for engines"""
+    """write textures, matrices or a network, a shader and a manifest for engines"""
+    from ddprt.runtime.animated_file import is_animated, load_animated
     from ddprt.runtime.model_file import load_model
 
     job = call.run()
-    job.export(load_model(job.folder / "model.ddprt"))
+    folder = job.folder / "model.ddprt"
+    model = load_animated(folder) if is_animated(folder) else load_model(folder)
+    job.export(model)
     print(f"textures: {job.folder / 'export'}")
-
-
-def verify(call: Call) -> None:
-    """find damaged or missing files of a dataset"""
-    from ddprt.dataset.manifest import Manifest
-    from ddprt.dataset.store import expected_files, read_description
-
-    folder = Path(call.file("a dataset or a run folder"))
-    folder = folder / "dataset" if (folder / "dataset").is_dir() else folder
-    description, manifest = read_description(folder), Manifest(folder)
-    faults = manifest.damaged()
-    faults += [f"{name}: not baked yet" for name in expected_files(description) if name not in manifest.entries]
-    if faults:
-        for fault in faults:
-            print(fault)
-        raise UserError(
-            f"{folder}: got {len(faults)} faulty files of {len(expected_files(description))}; "
-            "delete the damaged ones and run the bake again to make them anew"
-        )
-    print(f"{folder}: {len(manifest.entries)} files whole")
-
-
-def doctor(call: Call) -> None:
-    """check that everything ddprt needs works on this machine"""
-    from ddprt.pipeline_inspect import checkup
-
-    lines, fine = checkup()
-    print(lines)
-    if not fine:
-        raise UserError("doctor: got parts that are missing or broken, expected all to work; mend what is marked above")
+    if call.asks("table"):
+        print(f"{job.format_table(model)}\ntable:    {job.folder / 'export' / 'formats.json'}")
 
 
 @dataclass(frozen=True)
@@ -297,10 +176,36 @@ _LIMITS = {
     "max-bake-seconds": "X  most seconds to bake what is learned from",
     "max-fit-seconds": "X  most seconds to fit",
 }
+_SOURCES = {
+    "indirect": "'indirect/*.exr'  pictures to learn; the star stands for the name of the lighting",
+    "direct": "'direct/*.exr'  pictures of direct light",
+    "measured": "FILE  measured values, .npy, .npz or .csv, (lightings, points, 3), in place of direct light",
+    "lights": "FILE  .csv or .json table of lights, or an .lp file and its photographs",
+    "channels": "LAYER|R,G,B  of an EXR with several, wildcards allowed",
+    "direct-channels": "LAYER|R,G,B  of direct light alone",
+    "indirect-channels": "LAYER|R,G,B  of indirect light alone",
+    "colour": "NAME  colour space (default: auto, what the files say)",
+    "quantity": "NAME  irradiance, E/pi, radiosity, radiance or exitant (default: auto)",
+    "albedo": "FILE  of every texel",
+    "mask": "FILE  texels that count, above 0",
+    "position": "FILE  of every texel, metres",
+    "normal": "FILE  of every texel",
+    "area": "FILE  of every texel, m²",
+    "geometry": "FILE  .glb, .gltf or .obj with lightmap coordinates, metres, Y up",
+    "points": "N|FILE.json  texels of the direct maps to measure (default: 128)",
+    "measure": "texels|ball  direct light at texels, or a white ball under the lights",
+    "test": "X  share of lightings that are held out (default: 0.2)",
+    "validation": "X  share that learned methods stop on (default: 0.1)",
+    "seed": "N  of the split and the points",
+    "name": "NAME  of the scene in reports",
+}
 VERBS = {
     "run": Verb(run, options=_OUT),
     "inspect": Verb(inspect, "FILE.toml|SCENE|MESH"),
     "bake": Verb(bake, options=_OUT, flags={"dry-run": "tell seconds, rays, files and memory beforehand; writes nothing"}),
+    "import": Verb(
+        import_, "DIR|FILE.toml", _OUT | _SOURCES, {"clip": "cut negative light off instead of refusing it"}, configured=False
+    ),
     "fit": Verb(fit, options=_OUT),
     "eval": Verb(
         evaluate, options=_OUT, flags={"budget": "  take the error apart by its causes (section [budget]); bakes more"}
@@ -320,11 +225,28 @@ VERBS = {
     "relight": Verb(
         relight,
         "MODEL",
-        {"lighting": "FILE|JSON  a list of lightings, or one as text", "out": "FILE.exr  where to (default: relit.exr)"},
+        {
+            "lighting": "FILE|JSON  a list of lightings, or one as text",
+            "out": "FILE.exr  where to (default: relit.exr)",
+            "time": "SECONDS  when, for a model of an animation",
+        },
         configured=False,
     ),
-    "export": Verb(export, options=_OUT),
+    "export": Verb(
+        export, options=_OUT, flags={"table": "   error against bytes of every format of textures (docs/export.md)"}
+    ),
+    "view": Verb(
+        view,
+        "MODEL",
+        {
+            "html": "FILE.html  write one file that opens from disk, and serve nothing",
+            "dataset": "DIR  held-out lightings with their references and errors",
+            "port": "N  of the address on this machine (default: a free one)",
+        },
+        {"no-open": "open no browser"},
+        configured=False,
+    ),
     "verify": Verb(verify, "DIR", configured=False),
     "doctor": Verb(doctor, "", configured=False),
 }
-LATER = {"import", "view", "status"}
+LATER = {"status"}

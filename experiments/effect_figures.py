@@ -12,26 +12,32 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import integrate
 
 import ddprt
 from ddprt.config import checked as configured
 from ddprt.dataset.layers import read_layer, read_light
 from ddprt.lights import parse_lighting
+from ddprt.sampling.riding import place_riders
 from ddprt.scene.atlas import build_atlas
 from ddprt.scene.checks import checked
 from ddprt.scene.exr import write_exr
+from ddprt.scene.fog import Fog
 from ddprt.scene.library import build
 from ddprt.scene.material import Cutout, Emission, Gloss, Material, Subsurface
 from ddprt.scene.mesh import Scene
-from ddprt.scene.shapes import faceted, icosphere, rectangle
+from ddprt.scene.poses import posed
+from ddprt.scene.shapes import faceted, hollow, icosphere, rectangle
 from ddprt.sections import TransportConfig
 from ddprt.transport import ggx
 from ddprt.transport.embree import Tracer
+from ddprt.transport.reference import on_points, trace_reference
 
 Figure = dict[str, float]
 UP = (0.0, 1.0, 0.0)
 SUN = {"type": "directional", "direction": [0.6, -0.8, 0.0], "irradiance": [3.0, 3.0, 3.0]}
 HALF = 10.0
+POINT = {"type": "point", "position": [0.0, 1.0, 0.0], "intensity": [1.0, 1.0, 1.0]}
 
 
 def compared(found: Any, expected: Any, error: Any = None, *, unit: float = 0.0) -> Figure:
@@ -264,6 +270,35 @@ def probes(quick: bool) -> Figure:
     return compared(found, expected, noise, unit=expected[0, 0])
 
 
+def scattered_once(height: float, free: float, albedo: float, g: float) -> float:
+    """Irradiance of a place that faces a lamp of 1 W/sr, by fog without an end that scatters once.
+
+    Along each ray in the angle that the lamp sees it under, so that its singularity is gone.
+    """
+
+    def part(angle: float, theta: float) -> float:
+        foot, beside = height * np.cos(theta), height * np.sin(theta)
+        along, far = foot + beside * np.tan(angle), beside / np.cos(angle)
+        cosine = -np.sin(angle)  # between the ray and the way from there to the lamp
+        phase = (1 - g * g) / (4 * np.pi * (1 + g * g - 2 * g * cosine) ** 1.5)
+        return float(2 * np.pi * np.cos(theta) * np.sin(theta) / beside * albedo / free * np.exp(-(along + far) / free) * phase)
+
+    ends = lambda theta: theta - np.pi / 2  # noqa: E731  # where the ray begins
+    return float(integrate.dblquad(part, 1e-9, np.pi / 2, ends, lambda _: np.pi / 2 - 1e-9, epsabs=1e-7)[0])
+
+
+def fog(quick: bool) -> Figure:
+    """A lamp half a metre over the floor of a black room whose walls are ten free paths and more away: light scattered once."""
+    half, free, share, g = np.array([-HALF, HALF]), (1.0, 0.7, 0.4), (1.0, 0.8, 0.5), 0.3
+    room = faceted("room", hollow(np.ones((1, 1, 1), bool), half, half, half), (Material("black", (0.0,) * 3),))
+    scene, lamp = replace(room, fog=Fog(free, share, g)), parse_lighting({**POINT, "position": [0.0, 0.5 - HALF, 0.0]})
+    tracer = Tracer.of(scene, 2)
+    start = on_points(tracer, np.array([[0.0, -HALF, 0.0]]), np.array([UP]))
+    found = trace_reference(tracer, scene, lamp, start, 1, 1 << (14 if quick else 20), seed=0, bounces=1)
+    expected = [scattered_once(0.5, *of, g) for of in zip(free, share, strict=True)]
+    return compared(found.indirect[0], expected, np.sqrt(found.indirect_variance[0]))
+
+
 def hair(quick: bool) -> Figure:
     """White fur under a white sky of radiance 1: pi leaves every fibre, of which what the sky sends there straight is direct.
 
@@ -299,6 +334,20 @@ def hair(quick: bool) -> Figure:
     return compared(np.mean(runs), 1.0, np.std(runs, ddof=1) / math.sqrt(len(runs)))
 
 
+# --- what moves ----------------------------------------------------------------------------------------------------------
+
+
+def animation(quick: bool) -> Figure:
+    """A ball that has rolled and gone away, seen from inside: its points ride along, and light is a / (1 - a) as before."""
+    ball, turn = build("furnace", albedo=0.5, subdivisions=3), 1.1
+    cosine, sine = math.cos(turn), math.sin(turn)
+    moved = posed(ball, ball.positions @ [[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]] + [3.0, -1.0, 2.0], "rolled")
+    lamp = {"type": "point", "position": [3, -1, 2], "intensity": [1, 1, 1]}
+    riders = place_riders(ball, 256, seed=0, atlas=build_atlas(ball, 64)).at(moved.corners)
+    found, error = light_at(moved, lamp, riders.position, riders.normal, 400 if quick else 6400, part=1)
+    return compared(found.mean(), 4 * math.pi / ball.areas.sum(), np.linalg.norm(error) / len(error))
+
+
 FIGURES: dict[str, Callable[[bool], Figure]] = {
     "diffuse bounces": bounces,
     "point lights": point,
@@ -314,6 +363,8 @@ FIGURES: dict[str, Callable[[bool], Figure]] = {
     "emission": emission,
     "subsurface": subsurface,
     "hair": hair,
+    "fog": fog,
     "probes": probes,
+    "animation": animation,
 }
 """What tells of each effect that it is right. A new effect is one entry more, or the experiment and its test fail."""

@@ -77,7 +77,7 @@ class Stage:
 
 def second_opinion(name: str) -> dict[str, float] | None:
     """Mean and deviation of z-scores of an effect; None where Mitsuba has none of it."""
-    if name == "probes":
+    if name in ("probes", "fog"):  # fog: tests/test_mitsuba_fog.py
         return None
     if name == "emission":
         z = glowing_scores(build("neon"))

@@ -21,7 +21,8 @@ from pathlib import Path
 import ddprt
 from ddprt.config import load_config
 from ddprt.dataset.store import Dataset
-from ddprt.export.textures import LAYER, export_textures
+from ddprt.export.formats.exr import LAYER
+from ddprt.export.textures import export_textures
 from ddprt.methods.svd_ridge import LinearTransfer
 from ddprt.runtime.model import Model
 

@@ -20,7 +20,8 @@ from ddprt.bench.budget.budget import CAUSES, Budget, measure_budget, table
 from ddprt.bench.budget.chain import Link, squared_error, take_apart
 from ddprt.config import load_config
 from ddprt.errors import UserError
-from ddprt.export.textures import LAYER, export_textures
+from ddprt.export.formats.exr import LAYER
+from ddprt.export.textures import export_textures
 from ddprt.fitting.transfer import fit_transfer
 from ddprt.lights import lighting_json
 from ddprt.pipeline import Run

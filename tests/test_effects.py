@@ -32,7 +32,9 @@ from ddprt.scene.material import Emission, Gloss, Material
 from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import box, faceted, icosphere, rectangle
 from ddprt.sections import EffectsConfig, LightingsConfig
-from ddprt.transport.effects import EFFECTS, Plan, configured_scene, force, plan, sees_nothing
+from ddprt.transport.configured import configured_scene
+from ddprt.transport.convexity import sees_nothing
+from ddprt.transport.effects import EFFECTS, Plan, force, plan
 from ddprt.transport.embree import Tracer
 from ddprt.transport.reference import on_texels, trace_reference
 

@@ -26,7 +26,10 @@ WALK = [
     "bench",
     "pipeline_active",
     "pipeline",
+    "pipeline_animation",
     "pipeline_inspect",
+    "call",
+    "verbs_alone",
     "verbs",
     "cli",
 ]
@@ -111,6 +114,7 @@ def test_each_heavy_library_has_its_door() -> None:
     assert doors("pyoidn") == {"dataset/denoise.py"}
     assert doors("numba") == doors("llvmlite") == {"compiled.py"}
     assert doors("flip_evaluator") == {"report/perceived.py"}
+    assert doors("ispc_texcomp") == {"export/formats/bc6h.py"}
     assert doors("optax") == {"training/loop.py", "training/schedule.py"}
     assert {Path(name).parts[0] for name in doors("matplotlib")} == {"report"}
 

@@ -2,15 +2,14 @@
 
 import base64
 import io
-import json
 import re
 import struct
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pygltflib
 import pytest
+from gltf_files import FACING, PICTURE, TRIANGLE, Writer, one, png
 from PIL import Image
 
 from ddprt.errors import UserError
@@ -18,75 +17,7 @@ from ddprt.scene.files import load_scene
 from ddprt.scene.images import linear_image, srgb_to_linear
 from ddprt.scene.shapes import icosphere
 
-TRIANGLE = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
-FACING = np.array([[0.0, 0, 1]] * 3)
-PICTURE = np.array([[[255, 0, 0], [0, 255, 0], [0, 0, 255]], [[0, 0, 0], [188, 188, 188], [255, 255, 255]]], np.uint8)
-
-
-def png() -> bytes:
-    stream = io.BytesIO()
-    Image.fromarray(PICTURE).save(stream, "PNG")
-    return stream.getvalue()
-
-
-class Writer:
-    """A glTF document in the making; attributes are appended to one buffer."""
-
-    def __init__(self) -> None:
-        self.json: dict = {"asset": {"version": "2.0"}, "scenes": [{"nodes": []}]}
-        self.json |= {name: [] for name in ("accessors", "bufferViews", "meshes", "nodes")}
-        self.data = b""
-
-    def view(self, data: bytes, **more: int) -> int:
-        self.data += b"\0" * (-len(self.data) % 4)
-        self.json["bufferViews"].append({"buffer": 0, "byteOffset": len(self.data), "byteLength": len(data), **more})
-        self.data += data
-        return len(self.json["bufferViews"]) - 1
-
-    def accessor(self, rows: np.ndarray, kind: str = "<f4", **more: object) -> int:
-        rows = np.asarray(rows).astype(kind)
-        width = {1: "SCALAR", 2: "VEC2", 3: "VEC3"}[1 if rows.ndim == 1 else rows.shape[1]]
-        code = {"|i1": 5120, "|u1": 5121, "<i2": 5122, "<u2": 5123, "<u4": 5125, "<f4": 5126}[rows.dtype.str]
-        entry = {"bufferView": self.view(rows.tobytes()), "componentType": code, "count": len(rows), "type": width}
-        self.json["accessors"].append({**entry, **more})
-        return len(self.json["accessors"]) - 1
-
-    def mesh(
-        self, *, normals: bool = True, indices: str | None = "<u2", positions: np.ndarray = TRIANGLE, **primitive: object
-    ) -> int:
-        attributes = {"POSITION": self.accessor(positions), **dict(primitive.pop("attributes", {}))}  # type: ignore[call-overload]
-        if normals:
-            attributes["NORMAL"] = self.accessor(FACING)
-        if indices:
-            primitive["indices"] = self.accessor(np.arange(len(positions)), indices)
-        self.json["meshes"].append({"primitives": [{"attributes": attributes, **primitive}]})
-        return len(self.json["meshes"]) - 1
-
-    def node(self, *, root: bool = True, **node: object) -> int:
-        self.json["nodes"].append(node)
-        if root:
-            self.json["scenes"][0]["nodes"].append(len(self.json["nodes"]) - 1)
-        return len(self.json["nodes"]) - 1
-
-    def glb(self, path: Path) -> Path:
-        document = pygltflib.GLTF2.from_dict({**self.json, "buffers": [{"byteLength": len(self.data)}]})
-        document.set_binary_blob(self.data)
-        document.save_binary(str(path))
-        return path
-
-    def gltf(self, path: Path, uri: str | None = None) -> Path:
-        uri = uri or "data:application/octet-stream;base64," + base64.b64encode(self.data).decode()
-        path.write_text(json.dumps({**self.json, "buffers": [{"byteLength": len(self.data), "uri": uri}]}))
-        return path
-
-
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning:dataclasses_json")
-
-
-def one(**mesh: object) -> Writer:
-    writer = Writer()
-    writer.node(mesh=writer.mesh(**mesh))  # type: ignore[arg-type]
-    return writer
 
 
 @pytest.mark.parametrize("indices", ["|u1", "<u2", "<u4", None])
@@ -253,7 +184,7 @@ def spoil(writer: Writer, **entries: object) -> Writer:
         (lambda: spoil(one(), extensionsUsed=["KHR_draco_mesh_compression"]), "KHR_draco_mesh_compression.*without Draco"),
         (lambda: spoil(one(), extensionsRequired=["EXT_meshopt_compression"]), "EXT_meshopt_compression"),
         (lambda: spoil(one(), extensionsRequired=["XYZ_unheard_of"]), "required extension XYZ_unheard_of"),
-        (lambda: one(mode=5), "triangle strip or fan"),
+        (lambda: one(mode=7), "mode 7, expected 0 to 6"),
         (lambda: one(mode=1), "no triangles"),
         (lambda: spoil(one(), meshes=[]), "number 0 among meshes, expected one of the 0 there are; export it again"),
         (lambda: spoil(one(), scenes=[{"nodes": [7]}]), "number 7 among nodes, expected one of the 1 there are"),
@@ -543,7 +474,7 @@ def test_glb_header_is_held_against_the_length(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("source", "parameters", "says"),
     [
-        ("cornel", {}, 'did you mean "cornell".*known: convex, .*or a path that ends in .glb'),
+        ("cornel", {}, 'did you mean "cornell".*known: bending, convex, .*or a path that ends in .glb'),
         ("room.fbx", {}, 'suffix ".fbx", expected .glb'),
         ("some/where", {}, 'suffix ""'),
         ("nowhere/room.glb", {}, "no such file"),

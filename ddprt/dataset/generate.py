@@ -29,10 +29,12 @@ from ddprt.progress import Progress
 from ddprt.sampling.points import Samples, load_samples, place_samples
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
+from ddprt.scene.own_charts import charted
 from ddprt.sections import PointsConfig
 from ddprt.transport.direct import Texels
 from ddprt.transport.effects import Plan, plan
 from ddprt.transport.embree import Tracer
+from ddprt.transport.fogginess import refuse_beside_fog
 from ddprt.transport.glossiness import scattering
 from ddprt.transport.hairiness import refuse_beside
 from ddprt.transport.measure import measure
@@ -55,6 +57,7 @@ def bake(
     first: int | None = None,
     once: Once | None = None,
     progress: Progress | None = None,
+    places: Samples | None = None,
 ) -> Dataset:
     """Renders pairs of direct and indirect lightmaps.
 
@@ -73,6 +76,7 @@ def bake(
       first: of the training lightings that are chosen, bake only so many, the most telling; None bakes all.
       once: of several bakes with this scene and these settings, whatever their `first`: candidates are drawn and measured once.
       progress: shown if given.
+      places: where light is measured, in place of samples that are distributed; of a pose, those that ride on it.
     Returns:
       The finished dataset.
     Raises:
@@ -100,7 +104,9 @@ def bake(
         config, lightings = config.model_copy(update={"lightings": asked}), None
     keep_alive = tempfile.TemporaryDirectory(prefix="ddprt-") if out is None else None
     folder = Path(keep_alive.name if keep_alive else str(out))
-    return _Bake(scene, config, folder, progress or Progress(quiet=True), first, once or Once()).run(lightings, keep_alive)
+    return _Bake(scene, config, folder, progress or Progress(quiet=True), first, once or Once(), places).run(
+        lightings, keep_alive
+    )
 
 
 def check_points(config: Config, scene: Scene, atlas: Atlas) -> None:
@@ -139,8 +145,19 @@ def _records(entries: Sequence[tuple[str, Lighting]]) -> list[dict[str, Any]]:
 class _Bake:
     """One bake from start to end; every stage skips what the manifest already holds."""
 
-    def __init__(self, scene: Scene, config: Config, folder: Path, progress: Progress, first: int | None, once: Once) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        config: Config,
+        folder: Path,
+        progress: Progress,
+        first: int | None,
+        once: Once,
+        places: Samples | None = None,
+    ) -> None:
+        scene = charted(scene, config.atlas.use, config.atlas.resolution, config.atlas.padding)
         self.scene, self.config, self.folder, self.progress, self.first = scene, config, folder, progress, first
+        self.places = places
         once.bind(scene.digest, config.model_dump_json(include={"seed", "atlas", "lightings", "points"}))
         self.tracer, self.once = Tracer.of(scene, config.transport.threads), once
 
@@ -170,6 +187,7 @@ class _Bake:
         with self.progress.stage("atlas") as stage:
             size = self.config.atlas
             atlas, hidden = build_open_atlas(self.tracer, scattering(self.scene), size.resolution, size.padding)
+            stage.facts |= {} if self.scene.lightmap is None else {"charts": "the file's own"}
             stage.facts |= {"texels": atlas.count, "texels_per_metre": float(f"{atlas.texels_per_metre:.4g}"), **hidden}
         with self.progress.stage("points") as stage:
             samples = listed or self._sunk(self._placed(atlas), lightings)
@@ -181,6 +199,7 @@ class _Bake:
             lightings = [lighting for _, lighting in entries]
         effects = plan(self.scene, lightings, bounces=self.config.transport.bounces, probes=self.config.probes.asked)
         refuse_beside(effects.called, self.config.transport.denoise)
+        refuse_beside_fog(effects.called)
         description = self._description(entries, effects, drawn, samples)
         bounces = next(effect for effect in effects.effects if effect.name == "diffuse bounces")
         operator = description["transport"]["integrator"] == "operator"  # which tells what it left out, if anything
@@ -223,6 +242,7 @@ class _Bake:
             **{key: value for key, value in baked_settings(self.config, self.scene).items() if value != []},
             "quantity": "irradiance",
             **({"exitant": exitant} if (exitant := self._exitant()) else {}),
+            **({"fog": self.scene.fog.record} if self.scene.fog else {}),
             "unit": "W/m2",
             "points": self._points(samples),
             "plan": [asdict(effect) for effect in effects.effects],
@@ -258,8 +278,10 @@ class _Bake:
             )
 
     def _listed(self) -> Samples | None:
-        """The points of `points.file`, if it is given."""
+        """The points that are given, as they are or by `points.file`."""
         config = self.config.points
+        if self.places is not None:
+            return self.places
         if not config.file:
             return None
         samples = load_samples(config.file)

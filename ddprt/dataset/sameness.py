@@ -25,7 +25,7 @@ def baked_settings(config: Config, scene: Scene) -> dict[str, Any]:
     transport = config.transport.model_dump(exclude={"threads"})
     return {
         "scene": {"name": scene.name, "digest": scene.digest, "notes": list(scene.notes)},
-        "atlas": config.atlas.model_dump(),
+        "atlas": config.atlas.model_dump(exclude={"use"}),  # the scene's digest says which charts are used
         "seed": config.seed,
         "transport": transport | {"integrator": valid_integrator(transport["integrator"], scene)},
         "placing": config.points.model_dump(exclude={"quantity"}),

@@ -246,7 +246,7 @@ def grouped(reasons: Mapping[str, str], most: int) -> str:
 
 def _listed(config: LightingsConfig) -> Splits:
     counts = {name: getattr(config, name) for name in SPLITS}
-    listed = load_lightings(config.file)
+    listed = load_lightings(config.file, config.gltf_units)
     if len(listed) != sum(counts.values()):
         wanted = " + ".join(f"{name} {count}" for name, count in counts.items())
         raise UserError(

@@ -24,6 +24,7 @@ from ddprt.lights import Lighting, parse_lighting
 from ddprt.sampling.points import Samples
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.exr import exposure_for, read_exr, write_exr
+from ddprt.scene.fog import Fog
 from ddprt.scene.holes import Holes
 from ddprt.scene.mesh import Scene
 from ddprt.transport.translucency import exitant_texels
@@ -53,8 +54,18 @@ class Dataset:
     def lightings(self) -> tuple[Lighting, ...]:
         """All lightings, by index."""
         return tuple(
-            parse_lighting(entry["lights"], f"lightings[{i}]") for i, entry in enumerate(self.description["lightings"])
+            parse_lighting(entry["lights"], f"lightings[{i}]") if entry["lights"] or not self.imported else ()
+            for i, entry in enumerate(self.description["lightings"])
         )
+
+    @property
+    def imported(self) -> dict[str, Any]:
+        """Where light that ddprt did not bake comes from, and what it lacks; empty for what it baked."""
+        return dict(self.description.get("imported", {}))
+
+    def lacks(self, what: str) -> bool:
+        """Whether an import brought no "direct" or "noise" maps, or no "mesh"."""
+        return what in self.imported.get("lacks", ())
 
     def split(self, name: str) -> list[int]:
         """Indices of the lightings of "train", "validation" or "test"."""
@@ -119,7 +130,12 @@ class Dataset:
         return None if found is None else found.astype(bool)
 
     def shaded(self, indices: Sequence[int]) -> Float32[np.ndarray, "lightings texels 3"]:
-        """Direct light that surfaces scatter where it falls, W/m²: the maps, and 0 where all that leaves counts as indirect."""
+        """Direct light that surfaces scatter where it falls, W/m²: the maps, and 0 where all that leaves counts as indirect.
+
+        It is 0 too where an import brought no maps of it.
+        """
+        if self.lacks("direct"):
+            return np.zeros((len(indices), int(self.covered.sum()), 3), np.float32)
         values = self.maps("direct", indices)
         if self.exitant is not None:
             values[:, self.exitant] = 0
@@ -139,12 +155,24 @@ class Dataset:
         except ValueError as error:
             raise UserError(f"{path}: {error}; bake it again") from None
 
+    @cached_property
+    def fog(self) -> Fog | None:
+        """What light passes on its way; None for clear air.
+
+        Raises:
+          UserError: it is none that can be.
+        """
+        given = self.description.get("fog")
+        return None if given is None else Fog.of(given, f"{self.folder / 'dataset.json'}: fog")
+
     def maps(self, kind: str, indices: Sequence[int]) -> Float32[np.ndarray, "lightings texels 3"]:
         """Lightmaps of the covered texels in W/m²; kind is "direct", "indirect" or (held-out lightings) "noise"."""
         if kind == "indirect":
             pack = self._shelf.find([map_name(kind, index) for index in indices])
             if isinstance(pack, Pack):
                 return pack.read(indices)
+        if self.lacks(kind):
+            raise UserError(f"{self.folder}: got no {kind} maps, since the dataset was imported without them; do without")
         values = np.empty((len(indices), int(self.covered.sum()), 3), np.float32)
         for row, index in enumerate(indices):
             path = self.folder / map_name(kind, index)
@@ -263,9 +291,10 @@ def read_description(folder: Path) -> dict[str, Any]:
 def expected_files(description: dict[str, Any]) -> list[str]:
     """Names of all files of a finished dataset."""
     names = ["scene.safetensors", "points.safetensors", *ATLAS_FILES, *([CONSTANT] if _glows(description) else [])]
+    lacks = description.get("imported", {}).get("lacks", ())
     for index, entry in enumerate(description["lightings"]):
         kinds = ["direct", "measured", "indirect", *(["noise"] if entry["split"] == "test" else [])]
-        names += [map_name(kind, index) for kind in kinds]
+        names += [map_name(kind, index) for kind in kinds if kind not in lacks]
     for part in description.get("layers", []):
         layer = part["name"]
         names += [layer_name(layer, "places"), *([layer_name(layer, "constant")] if part.get("constant") else [])]
@@ -321,9 +350,13 @@ def write_atlas(folder: Path, atlas: Atlas, manifest: Manifest) -> None:
     """The G-buffer as float EXRs, 0 where nothing is covered."""
     for name in _GBUFFER:
         values = np.asarray(getattr(atlas, name), np.float32)
-        image = atlas.image(values.reshape(atlas.count, -1))
-        write_exr(folder / "atlas" / f"{name}.exr", image)
-        manifest.add(f"atlas/{name}.exr")
+        write_plane(folder, name, atlas.image(values), manifest)
+
+
+def write_plane(folder: Path, name: str, image: Float32[np.ndarray, "height width *channels"], manifest: Manifest) -> None:
+    """One picture of the G-buffer."""
+    write_exr(folder / "atlas" / f"{name}.exr", image.reshape(*image.shape[:2], -1))
+    manifest.add(f"atlas/{name}.exr")
 
 
 def scene_tensors(scene: Scene, atlas: Atlas) -> dict[str, np.ndarray]:

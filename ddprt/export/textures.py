@@ -1,10 +1,12 @@
 """Basis textures, transfer matrices and a manifest: everything a shader needs, nothing it does not.
 
 Mono channel packs four bases into an RGBA layer; multi channel gives each basis an RGB image. Every basis is scaled to a
-largest magnitude of 1, which spends the bits of half floats best, and the scale is pushed into its row of the matrix.
+largest magnitude of 1, which spends the bits of half floats best, and the scale is pushed into its row of the matrix. Formats
+other than EXR layers bring a transfer of their own, see `ddprt.export.stored`.
 """
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +14,19 @@ import numpy as np
 
 from ddprt import __version__
 from ddprt.errors import UserError
+from ddprt.export.formats.exr import MEAN
+from ddprt.export.formats.format import Maps
+from ddprt.export.formats.listing import FORMATS, check_formats
 from ddprt.export.seams import Stitcher, find_seams
-from ddprt.files import write_tensors, write_text
+from ddprt.export.stored import DECODE as DECODE_FORMAT
+from ddprt.export.stored import remove_stale, transfer_name, write_format
+from ddprt.files import make_folder, write_tensors, write_text
 from ddprt.methods.svd_ridge import LinearTransfer
 from ddprt.runtime.model import Model
 from ddprt.scene.exr import write_exr
 from ddprt.scene.gutter import fill_gutter
 
 SCHEMA = 1
-LAYER = 4  # bases per RGBA texture
 CONSTANT = "constant.exr"
 EXITANT = "exitant.exr"
 
@@ -58,6 +64,8 @@ def export_textures(
     precision: str = "half",
     gutter: int = 4,
     stitch: bool = True,
+    formats: Sequence[str] = ("exr",),
+    refit: bool = True,
 ) -> list[Path]:
     """Writes the export of a linear model.
 
@@ -67,46 +75,41 @@ def export_textures(
       precision: "half" or "float" EXR.
       gutter: texels that charts are extended by.
       stitch: make charts agree where a smooth surface was cut; the manifest says what that did, or why it was not done.
+      formats: entries of `FORMATS` for the basis textures.
+      refit: fit the transfer of each format but "exr" to the textures as it holds them.
     Returns:
       The files, the manifest last.
     Raises:
-      UserError: the method has no linear export, or the folder cannot be written.
+      UserError: the method has no linear export, the folder cannot be written, or a format is unknown, cannot hold the
+        lightmap or lacks its library.
     """
+    maps, seams = textures(model, precision=precision, gutter=gutter, stitch=stitch)
     relighter = model.relighter
-    if not isinstance(relighter, LinearTransfer):
-        raise UserError(f'export: got a model of method "{model.method}", expected svd-ridge; set fit.method = "svd-ridge"')
+    assert isinstance(relighter, LinearTransfer)
+    check_formats(formats, *model.covered.shape)
     folder = Path(folder)
-    mono = model.encoding.channels == "mono"
-    bases = np.asarray(relighter.basis, np.float32)
-    has_mean = bool(np.any(relighter.mean))
-    images = [_image(model, entries, gutter) for entries in [*bases, *([np.asarray(relighter.mean)] if has_mean else [])]]
-    images, seams = _stitched(model, images, gutter, stitch)
-    sizes = np.array([np.abs(image).max(initial=0) for image in images[: len(bases)]], np.float32)
+    mono, has_mean = model.encoding.channels == "mono", len(maps.values) > maps.bases
+    if tuple(formats) != ("exr",) and not len(maps.values):
+        raise UserError('export.formats: got a model without any light, which has no textures; keep formats = ["exr"]')
+    sizes = np.abs(maps.values[: maps.bases]).max((1, 2, 3), initial=0)
     scale = np.where(sizes > 0, sizes, 1).astype(np.float32)
-    mean = images[len(bases) :]
-    images = [image / size for image, size in zip(images, scale, strict=False)]
-    half = precision == "half"
-    written, layers = [], []
+    written: list[Path] = []
     constant = None
     if model.constant is not None:
         (constant,), _ = _stitched(model, [_image(model, model.constant, gutter)], gutter, stitch)
-    if mono:
-        for first in range(0, len(images), LAYER):
-            group = images[first : first + LAYER]
-            group = group + [np.zeros_like(group[0])] * (LAYER - len(group))
-            layers.append((f"basis_{first // LAYER:02d}.exr", np.concatenate(group, 2)))
-    else:
-        layers = [(f"basis_{index:02d}.exr", image) for index, image in enumerate(images)]
-    layers += [("mean.exr", image) for image in mean]
-    kept = {name for name, _ in layers}
-    kept |= set() if constant is None else {CONSTANT}
-    kept |= set() if model.exitant is None else {EXITANT}
-    for stale in [*folder.glob("basis_*.exr"), *folder.glob("mean.exr"), *folder.glob(CONSTANT), *folder.glob(EXITANT)]:
-        if stale.name not in kept:  # of an earlier export with more bases
-            stale.unlink()
-    for name, image in layers:
-        write_exr(folder / name, image, half=half)
-        written.append(folder / name)
+    layers: list[str] = []
+    if "exr" in formats:
+        layers = list(FORMATS["exr"].write(maps, folder).files)
+        written += [folder / name for name in layers]
+    told = {}
+    for name in [name for name in formats if name != "exr"]:
+        make_folder(folder)
+        files, told[name] = write_format(model, maps, name, folder, refit=refit)
+        written += files
+    remove_stale(folder, [*written, folder / transfer_name("exr")])
+    for name, there in ((CONSTANT, constant is not None), (EXITANT, model.exitant is not None)):
+        if not there:
+            (folder / name).unlink(missing_ok=True)
     if constant is not None:  # in W/m², which halves may not reach
         write_exr(folder / CONSTANT, constant, half=False)
         written.append(folder / CONSTANT)
@@ -140,7 +143,7 @@ def export_textures(
         "scene": model.scene,
         "width": model.covered.shape[1],
         "height": model.covered.shape[0],
-        "bases": len(bases),
+        "bases": maps.bases,
         "points": model.points,
         "samples": len(model.samples.position),
         "quantity": model.quantity,
@@ -149,9 +152,9 @@ def export_textures(
         "gamma": model.encoding.gamma,
         "channels": model.encoding.channels,
         "precision": precision,
-        "layers": [name for name, _ in layers if name != "mean.exr"],
+        "layers": [name for name in layers if name != MEAN],
         "packing": "basis 4 i + c is channel c of layer i" if mono else "layer i is basis i in RGB",
-        "mean": "mean.exr" if has_mean else None,
+        "mean": MEAN if has_mean and layers else None,
         "basis_scale": scale.tolist(),
         "seams": seams,
         "matrix": {"file": "transfer.safetensors", "axes": "rgb, bases, points" if mono else "1, bases, points * rgb"},
@@ -164,13 +167,40 @@ def export_textures(
         manifest["constant"] = CONSTANT
     if model.exitant is not None:
         manifest["exitant"] = EXITANT
+    if told:
+        manifest["formats"] = told
+        manifest["decode_formats"] = DECODE_FORMAT
     write_text(folder / "manifest.json", json.dumps(manifest, indent=1, ensure_ascii=False) + "\n")
     return [*written, folder / "transfer.safetensors", folder / "points.json", folder / "manifest.json"]
+
+
+def textures(model: Model, *, precision: str = "half", gutter: int = 4, stitch: bool = True) -> tuple[Maps, dict[str, Any]]:
+    """All textures of a linear model in float32, charts extended and stitched, and what the manifest says of seams.
+
+    Args:
+      model: of method svd-ridge.
+      precision, gutter, stitch: as for `export_textures`.
+    Raises:
+      UserError: the method has no linear export.
+    """
+    relighter = model.relighter
+    if not isinstance(relighter, LinearTransfer):
+        raise UserError(f'export: got a model of method "{model.method}", expected svd-ridge; set fit.method = "svd-ridge"')
+    bases, mean = np.asarray(relighter.basis, np.float32), np.asarray(relighter.mean)
+    images = [_image(model, entries, gutter) for entries in [*bases, *([mean] if np.any(mean) else [])]]
+    images, seams = _stitched(model, images, gutter, stitch)
+    empty = np.zeros((0, *model.covered.shape, 1 if model.encoding.channels == "mono" else 3), np.float32)
+    return Maps(np.stack(images) if images else empty, len(bases), _known(model, gutter), precision), seams
 
 
 def _image(model: Model, entries: np.ndarray, gutter: int) -> np.ndarray:
     """Entries of a basis or mean as an image of 1 (mono) or 3 (multi) channels, charts extended."""
     return fill_gutter(model.image(entries.reshape(int(model.covered.sum()), -1)), model.covered, gutter)
+
+
+def _known(model: Model, gutter: int) -> np.ndarray:
+    """Texels of charts and gutter."""
+    return fill_gutter(model.covered[..., None].astype(np.float32), model.covered, gutter)[..., 0] > 0
 
 
 def _stitched(model: Model, images: list[np.ndarray], gutter: int, stitch: bool) -> tuple[list[np.ndarray], dict[str, Any]]:
@@ -182,10 +212,9 @@ def _stitched(model: Model, images: list[np.ndarray], gutter: int, stitch: bool)
     if model.uv is None:
         return images, {
             "stitched": False,
-            "why": "a model of an older version, without lightmap coordinates; bake and fit again",
+            "why": "no lightmap coordinates: the light was imported without a mesh, or an older version baked it",
         }
-    known = fill_gutter(model.covered[..., None].astype(np.float32), model.covered, gutter)[..., 0] > 0
-    stitcher = Stitcher(find_seams(model.occluders, model.uv, known))
+    stitcher = Stitcher(find_seams(model.occluders, model.uv, _known(model, gutter)))
     closed = [stitcher.stitch(image) for image in images]
     size = [max(float(np.abs(image).max(initial=0)), 1e-30) for image in closed]
     before, after = (

@@ -6,7 +6,7 @@ what stands in between. Geometry, rays and randomness never enter; random number
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError
 
@@ -26,6 +26,7 @@ LIGHTS: Catalogue[type] = Catalogue(
         for light in (PointLight, SpotLight, DirectionalLight, RectLight, SphereLight, EnvironmentLight, MeshLight)
     },
 )
+Units = Literal["photometric", "radiometric"]
 Lighting = tuple[Light, ...]
 """Lights that are on together."""
 
@@ -88,12 +89,31 @@ def _fault(fault: Any, where: str) -> str:
     return f"{place}: {text or explain([fault], [0, 1, 0])}"
 
 
-def load_lightings(path: str | Path) -> list[Lighting]:
-    """Reads a JSON list of lightings (each a list of lights).
+def scene_lights(path: str | Path, units: Units = "photometric") -> Lighting:
+    """The lights of a glTF file, all on together, as its author sees them; see `ddprt.lights.gltf`.
 
+    Args:
+      path: a .glb or .gltf with KHR_lights_punctual.
+      units: "photometric": candela and lux, by 683 lm a watt; "radiometric": W/sr and W/m² as they stand.
+    Raises:
+      UserError: missing, damaged, without lights, or a faulty light.
+    """
+    from ddprt.lights.gltf import light_records  # brings a reader of glTF
+
+    return parse_lighting(light_records(Path(path), units), f"{path}: lights")
+
+
+def load_lightings(path: str | Path, units: Units = "photometric") -> list[Lighting]:
+    """Reads a JSON list of lightings (each a list of lights), or a glTF file, of which each light is a lighting.
+
+    Args:
+      path: of either.
+      units: of a glTF file's lights; see `scene_lights`.
     Raises:
       UserError: missing, not JSON, empty, or a faulty light.
     """
+    if Path(path).suffix.lower() in (".glb", ".gltf"):
+        return [(light,) for light in scene_lights(path, units)]
     try:
         document = json.loads(Path(path).read_text("utf-8"))
     except OSError as error:
@@ -126,4 +146,5 @@ __all__ = [
     "lighting_json",
     "load_lightings",
     "parse_lighting",
+    "scene_lights",
 ]

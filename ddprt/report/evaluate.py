@@ -96,7 +96,7 @@ def evaluate(data: Dataset, models: Mapping[str, Model], fit_seconds: Mapping[st
         "dark_test_lightings": int((truth.squares == 0).sum()),
         "methods": scores,
         "floors": {
-            "noise_relative_rmse": truth.relative_rmse(data.maps("noise", test)),
+            "noise_relative_rmse": None if data.lacks("noise") else truth.relative_rmse(data.maps("noise", test)),
             "projection_relative_rmse": projection_error(data, main, truth),
             "mean_relative_rmse": scores.get("mean", {}).get("relative_rmse"),
         },
@@ -336,6 +336,8 @@ def _frame_by_frame(model: Model, values: np.ndarray, lightings: Sequence[Any]) 
 
 
 def _distance_to_surface(data: Dataset, model: Model, indices: list[int]) -> np.ndarray:
+    if data.lacks("mesh"):
+        return np.full(len(indices), np.nan)
     anchors = [[a for light in data.lightings[i] if (a := light.anchor()) is not None] for i in indices]
     tracer = model._tracer
     return np.array([float(tracer.clearance(np.array(a)).min()) if a else np.nan for a in anchors])

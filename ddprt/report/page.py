@@ -240,7 +240,8 @@ def _pictures(
     if scene is not None:
         atlas = data.description["atlas"]
         tracer = Tracer.of(scene, config.transport.threads)
-        uv, _ = unwrap(scene, atlas["resolution"], atlas["padding"])
+        uv = data.uv if data.imported else unwrap(scene, atlas["resolution"], atlas["padding"])[0]
+        assert uv is not None
         view = take_view(tracer, uv, data.covered, default_camera(scene))
         seen = shots(evaluation, data, main, model, scene, tracer, uv, config.report.views)
     truth, predicted, test = evaluation.truth, evaluation.predicted[main], data.split("test")

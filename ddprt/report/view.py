@@ -73,12 +73,17 @@ _CAMERAS = {**dict.fromkeys(("cornell", "cornell-hole", "glossy-room"), _CORNELL
 
 def default_camera(scene: Scene) -> Camera:
     """A camera that sees the whole scene: the customary one for library scenes, else from outside at three quarters."""
-    if scene.name in _CAMERAS:
-        return _CAMERAS[scene.name]
+    return camera_for(scene.name, scene.corners)
+
+
+def camera_for(name: str, triangles: Float64[np.ndarray, "triangles 3 3"]) -> Camera:
+    """The same by the scene's name and its triangles' corners, metres."""
+    if name in _CAMERAS:
+        return _CAMERAS[name]
     away = _unit(np.array([0.5, 0.55, 1.0]))
     # Only what shows its front is seen, so only that has to fit.
-    showing = scene.geometric_normals @ away > 0
-    corners = scene.corners[showing if showing.any() else slice(None)].reshape(-1, 3)
+    showing = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]) @ away > 0
+    corners = triangles[showing if showing.any() else slice(None)].reshape(-1, 3)
     target = (corners.min(0) + corners.max(0)) / 2
     camera = Camera(triple(target + away), triple(target))
     across, depth = np.split((corners - target) @ camera.axes.T, [2], 1)

@@ -22,6 +22,7 @@ from ddprt.methods.method import AsksForLights, Frame, Relighter
 from ddprt.runtime.coefficients import Coefficients
 from ddprt.runtime.trust import Trust, Yardstick
 from ddprt.sampling.points import Samples
+from ddprt.scene.fog import Fog
 from ddprt.scene.holes import Holes
 
 _LARGEST = float(np.finfo(np.float32).max)
@@ -43,7 +44,7 @@ class Model:
       covered: which texels of the lightmap carry light.
       area: of the covered texels, m².
       occluders: triangle corners that cast shadows, metres.
-      scene: name and digest of what it was trained on.
+      scene: name and digest of what it was trained on; "unmeasured" tells why it cannot measure lights by itself, if it cannot.
       uv: lightmap coordinates of the occluders' corners, origin top-left; None in models of older versions.
       yardstick: what trust is measured with; None likewise.
       layers: what answers for light besides the lightmap, by name of the layer.
@@ -51,6 +52,8 @@ class Model:
       constant: irradiance of emissive surfaces, which no light changes, W/m²; None where nothing glows.
       exitant: covered texels whose light is all that leaves them, to which no diffuse reflection of lamps comes; None where
         there are none.
+      albedo: of the covered texels, linear, to show them by; no answer depends on it. None in models of older versions.
+      fog: what fills the bounding box of the occluders; None for clear air.
     """
 
     method: str
@@ -69,6 +72,8 @@ class Model:
     holes: Holes | None = None
     constant: np.ndarray | None = None
     exitant: np.ndarray | None = None
+    albedo: np.ndarray | None = None
+    fog: Fog | None = None
 
     def predict(
         self,
@@ -169,13 +174,19 @@ class Model:
         return Trust(*(np.asarray(getattr(found, entry.name)[0]) for entry in fields(found))) if single else found
 
     def measure(self, lighting: Lighting | Light | Sequence[dict[str, Any]] | dict[str, Any]) -> np.ndarray:
-        """(points, 3) float32: direct light at the points with shadow rays, W/m², as `predict` takes it."""
+        """(points, 3) float32: direct light at the points with shadow rays, W/m², as `predict` takes it.
+
+        Raises:
+          UserError: no lighting, or a model of imported light that lacks what it would take.
+        """
         return self.measure_all([lighting])[0]
 
     def measure_all(self, lightings: Sequence[Any]) -> np.ndarray:
         """(lightings, points, 3) float32: `measure` of each, on all cores; the same bits."""
         from ddprt.transport.measure import measure
 
+        if "unmeasured" in self.scene:
+            raise UserError(f"measure: got a lighting, but {self.scene['unmeasured']}")
         samples = self.samples
 
         def work(lighting: Any) -> np.ndarray:
@@ -278,7 +289,7 @@ class Model:
     def _tracer(self) -> Any:
         from ddprt.transport.embree import Tracer
 
-        return Tracer(self.occluders, holes=self.holes)
+        return Tracer(self.occluders, holes=self.holes, fog=self.fog)
 
 
 @dataclass(frozen=True, eq=False)

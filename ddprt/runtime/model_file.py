@@ -24,6 +24,7 @@ from ddprt.methods.method import FitReport
 from ddprt.runtime.model import LayerModel, Model
 from ddprt.runtime.trust import Yardstick
 from ddprt.sampling.points import Samples
+from ddprt.scene.fog import Fog
 from ddprt.scene.holes import Holes
 
 SCHEMA = 1
@@ -98,6 +99,8 @@ def save_model(model: Model, folder: Path) -> None:
         tensors["light.constant"] = model.constant
     if model.exitant is not None:
         tensors["atlas.exitant"] = model.exitant
+    if model.albedo is not None:
+        tensors["atlas.albedo"] = model.albedo
     trust: dict[str, float] = {}
     if model.yardstick is not None:
         for entry in fields(model.yardstick):
@@ -134,6 +137,7 @@ def save_model(model: Model, folder: Path) -> None:
         "relighter": static,
         "report": asdict(model.relighter.report),
         "trust": trust or None,
+        **({"fog": model.fog.record} if model.fog else {}),
         **({"layers": [_layer_entry(part.layer) for part in model.layers.values()]} if model.layers else {}),
         "unit": "W/m2",
         "tensors_sha256": sha256(folder / "tensors.safetensors"),
@@ -225,6 +229,9 @@ def _assemble(
     exitant = tensors.get("atlas.exitant")
     if exitant is not None and exitant.shape != (int(tensors["atlas.covered"].sum()),):
         raise ValueError(f"got exitant texels of shape {exitant.shape}")
+    paint = tensors.get("atlas.albedo")
+    if paint is not None and paint.shape != (int(tensors["atlas.covered"].sum()), 3):
+        raise ValueError(f"got albedo of shape {paint.shape}")
     position, normal, albedo = (tensors[f"points.{name}"] for name in ("position", "normal", "albedo"))
     samples = Samples(position, normal, albedo, places.spacing, places.depth)
     return Model(
@@ -244,6 +251,8 @@ def _assemble(
         Holes.read(tensors, len(tensors["scene.corners"])),
         constant,
         exitant,
+        paint,
+        None if document.get("fog") is None else Fog.of(document["fog"], "model.json: fog"),
     )
 
 

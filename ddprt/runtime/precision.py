@@ -58,6 +58,28 @@ def stored(model: Model, precision: str) -> Model:
     return replace(model, relighter=replace(rounded, report=relighter.report))
 
 
+def composed(
+    model: Model,
+    basis: Float[np.ndarray, "rows entries"],
+    *,
+    matrix: Float[np.ndarray, "groups rows inputs"],
+    offset: Float[np.ndarray, "groups inputs"],
+    intercept: Float[np.ndarray, "groups rows"],
+) -> Model:
+    """The model with other textures and the transfer that goes with them; a mean is one of the textures.
+
+    Args:
+      model: of method svd-ridge.
+      basis: over covered texels, colours of a texel side by side for multi channel.
+      matrix, offset, intercept: as in `LinearTransfer`.
+    """
+    relighter = model.relighter
+    assert isinstance(relighter, LinearTransfer)
+    m, o, i, u = (jnp.asarray(part, jnp.float32) for part in (matrix, offset, intercept, basis))
+    changed = replace(relighter, matrix=m, offset=o, intercept=i, basis=u, mean=jnp.zeros(basis.shape[1], jnp.float32))
+    return replace(model, relighter=changed)
+
+
 def shipped_bytes(model: Model, precision: str) -> int:
     """Bytes of the arrays that an engine needs to relight: maps over covered texels and matrices, in that precision.
 

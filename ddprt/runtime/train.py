@@ -113,7 +113,7 @@ def fit_method(
     pack = _streamed(data, method, name, stream)
     train, validation = (examples(data, split, encoding, config, points, quantity, pack) for split in ("train", "validation"))
     relighter = method.fit(train, validation, key=jax.random.key(seeds.number(seed, f"method {name}")))
-    relighter, yardstick = _judged(relighter, encoding, train, validation)
+    relighter, yardstick = judged(relighter, encoding, train, validation)
 
     def of_layer(layer: Layer) -> LayerModel:
         part = LayerData.of(data, layer)
@@ -131,14 +131,22 @@ def fit_method(
         data.covered,
         data.area,
         data.occluders,
-        {key: data.description["scene"][key] for key in ("name", "digest")},
+        {key: data.description["scene"][key] for key in ("name", "digest")} | _unmeasured(data),
         data.uv,
         yardstick,
         Catalogue("layer", of_layers),
         None if isinstance(data, LayerData) else data.holes,
         data.constant,
         None if isinstance(data, LayerData) else data.exitant,
+        None if isinstance(data, LayerData) else data.gbuffer["albedo"],
+        None if isinstance(data, LayerData) else data.fog,
     )
+
+
+def _unmeasured(data: Dataset) -> dict[str, str]:
+    """Why a model of imported light cannot measure lamps by itself, where it cannot."""
+    why = "" if isinstance(data, LayerData) else data.imported.get("unmeasured", "")
+    return {"unmeasured": why} if why else {}
 
 
 def _with_trouble_of(relighter: Relighter, of_layers: Mapping[str, FitReport]) -> Relighter:
@@ -151,7 +159,7 @@ def _with_trouble_of(relighter: Relighter, of_layers: Mapping[str, FitReport]) -
     return replace(relighter, report=replace(own, trouble=told).noting("diverged"))  # type: ignore[type-var]
 
 
-def _judged(relighter: Relighter, encoding: Encoding, train: Examples, validation: Examples) -> tuple[Relighter, Yardstick]:
+def judged(relighter: Relighter, encoding: Encoding, train: Examples, validation: Examples) -> tuple[Relighter, Yardstick]:
     """The laws that a method beats mean lightmap and black on its validation set and was trained on its kind, or says not."""
     mean = _mean_lightmap(train, validation)
     ours, floor, whole = (_squares(one, encoding, validation) for one in (relighter, mean, None))

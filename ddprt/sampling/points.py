@@ -79,6 +79,13 @@ def place_samples(scene: Scene, count: int, *, on: str, seed: int, atlas: Atlas 
     Raises:
       UserError: the hull is flat, or next to nothing is in the open.
     """
+    return placed(scene, count, on=on, seed=seed, atlas=atlas)[0]
+
+
+def placed(
+    scene: Scene, count: int, *, on: str, seed: int, atlas: Atlas | None = None
+) -> tuple[Samples, Int[np.ndarray, " samples"], Float64[np.ndarray, "samples 3"]]:
+    """The same, and where they are on it: the triangle of each (of the hull, if they are on that), and its corners' weights."""
     rng = seeds.stream(seed, "points")
     if on == "hull":
         corners, normals = _hull(scene)
@@ -110,7 +117,7 @@ def place_samples(scene: Scene, count: int, *, on: str, seed: int, atlas: Atlas 
         albedo = scene.albedo_at(nearest, np.full((count, 3), 1 / 3))
     else:
         albedo = scene.albedo_at(triangle, weights)
-    return Samples(position, normals[triangle], albedo, float(np.sqrt(area / count)))
+    return Samples(position, normals[triangle], albedo, float(np.sqrt(area / count))), triangle, weights
 
 
 def _in_the_open(

@@ -14,7 +14,9 @@ from ddprt.axes import Float64
 from ddprt.errors import UserError
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+_EMPTY = 1 << 22
+"""Rows of an accessor that no bytes stand behind: a count alone must not fill the memory."""
 
 
 @dataclass(frozen=True)
@@ -44,31 +46,80 @@ class Container:
     def accessor(self, number: int, width: int) -> Float64[np.ndarray, "count width"]:
         """Rows of an accessor: strides are followed, normalised integers become -1 to 1, other integers stay exact.
 
+        Sparse accessors are filled in.
+
         Args:
           number: of the accessor.
           width: numbers per row that its type must have.
         """
         accessor = self.entry("accessors", number)
-        if accessor.sparse is not None or accessor.bufferView is None:
-            raise self.fault("got a sparse accessor, which is not read; export without sparse accessors")
         if _WIDTHS.get(accessor.type) != width:
             raise self.fault(f"got accessor {number} of {accessor.type}, expected {width} numbers; export it again")
-        if accessor.componentType not in _TYPES:
-            known = ", ".join(map(str, _TYPES))
-            raise self.fault(
-                f"got accessor {number} of component type {accessor.componentType}, expected one of {known}; export it again"
-            )
-        kind = np.dtype(_TYPES[accessor.componentType])
-        step = self.entry("bufferViews", accessor.bufferView).byteStride or kind.itemsize * width
-        shape, strides, start = (accessor.count, width), (step, kind.itemsize), accessor.byteOffset or 0
-        data = self.view(accessor.bufferView)
-        end = start + (accessor.count - 1) * step + width * kind.itemsize if accessor.count else start
-        if not 0 <= start <= end <= len(data):
-            raise self.fault(f"got {len(data)} bytes for accessor {number}, expected {end}; it is damaged: export it again")
-        rows = np.ndarray(shape, kind, data, start, strides)
-        if accessor.normalized:
+        kind = self._kind(number, accessor.componentType)
+        if not isinstance(accessor.count, int) or accessor.count < 0:
+            raise self.fault(f"got {accessor.count} rows in accessor {number}, expected a count; export it again")
+        if accessor.bufferView is None:
+            rows = self._zeros(number, accessor, kind, width)
+        else:
+            rows = self._rows(number, accessor.bufferView, accessor.byteOffset, kind, (accessor.count, width))
+        if accessor.sparse is not None:
+            rows = self._replaced(number, accessor, rows)
+        if accessor.normalized and kind.kind in "iu":
             return np.maximum(rows / float(np.iinfo(kind).max), -1.0)
         return rows.astype(np.float64)
+
+    def width(self, number: int) -> int:
+        """Numbers per row of an accessor; 0 for a type that is no row, such as a matrix."""
+        return _WIDTHS.get(self.entry("accessors", number).type, 0)
+
+    def _kind(self, number: int, component: int) -> np.dtype:
+        if component not in _TYPES:
+            known = ", ".join(map(str, _TYPES))
+            raise self.fault(f"got accessor {number} of component type {component}, expected one of {known}; export it again")
+        return np.dtype(_TYPES[component])
+
+    def _zeros(self, number: int, accessor: Any, kind: np.dtype, width: int) -> np.ndarray:
+        """What an accessor without bytes of its own holds before sparse rows are put in."""
+        if accessor.sparse is None:
+            raise self.fault(f"got accessor {number} without a buffer view, expected its bytes; export it again")
+        if accessor.count > _EMPTY:
+            raise self.fault(
+                f"got accessor {number} of {accessor.count} rows without a buffer view, expected at most {_EMPTY}; export "
+                "without sparse accessors"
+            )
+        return np.zeros((accessor.count, width), kind)
+
+    def _rows(self, number: int, view: int, offset: int | None, kind: np.dtype, shape: tuple[int, int]) -> np.ndarray:
+        """Rows as they lie in a buffer view, without a copy."""
+        count, width = shape
+        step = self.entry("bufferViews", view).byteStride or kind.itemsize * width
+        data, start = self.view(view), offset or 0
+        if step < 0:
+            raise self.fault(f"got byteStride {step} of buffer view {view}, expected 4 to 252; export it again")
+        end = start + (count - 1) * step + width * kind.itemsize if count else start
+        if not 0 <= start <= end <= len(data):
+            raise self.fault(f"got {len(data)} bytes for accessor {number}, expected {end}; it is damaged: export it again")
+        return np.ndarray(shape, kind, data, start, (step, kind.itemsize))
+
+    def _replaced(self, number: int, accessor: Any, rows: np.ndarray) -> np.ndarray:
+        """The rows with those in their places that a sparse accessor lists."""
+        sparse = accessor.sparse
+        if not (sparse.count and sparse.indices and sparse.values) or sparse.count > len(rows):
+            raise self.fault(
+                f"got sparse accessor {number} of {sparse.count} rows without indices, values or as many rows to replace, "
+                f"expected 1 to {len(rows)} with both; export without sparse accessors"
+            )
+        of_index, of_value = sparse.indices, sparse.values
+        kind = self._kind(number, of_index.componentType)
+        where = self._rows(number, of_index.bufferView, of_index.byteOffset, kind, (sparse.count, 1))[:, 0].astype(np.int64)
+        if not ((where >= 0) & (where < len(rows))).all():
+            raise self.fault(
+                f"got row {where.max()} in sparse accessor {number}, expected 0 to {len(rows) - 1}; export it again"
+            )
+        replaced = rows.copy()
+        shape = (sparse.count, rows.shape[1])
+        replaced[where] = self._rows(number, of_value.bufferView, of_value.byteOffset, rows.dtype, shape)
+        return replaced
 
     def view(self, number: int) -> memoryview:
         """The bytes of a buffer view."""

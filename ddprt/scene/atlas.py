@@ -185,7 +185,7 @@ class Atlas:
       albedo: area-weighted mean, linear.
       area: m²; sums to the area of the mesh, or to what of it is in the open (see `transport.openness`).
       coverage: share of the texel's square that is covered.
-      chart: xatlas chart; where walls stand on one, each region that they bound has its own number.
+      chart: of xatlas or of the file; where walls stand on one, each region that they bound has its own number.
       centre: of the scene; `sampler` works relative to it, so that float32 suffices.
       parted: texels that lie on both sides of a wall, and belong to one of them.
       part: which texel's light lies on each small square of those; -1 for none, where a square touches the wall itself.
@@ -263,7 +263,22 @@ def build_atlas(scene: Scene, resolution: int = 256, padding: int = 2) -> Atlas:
     Raises:
       UserError: the charts do not fit.
     """
-    uv, chart = unwrap(scene, resolution, padding)
+    return measured_atlas(scene, *unwrap(scene, resolution, padding), resolution)
+
+
+def measured_atlas(
+    scene: Scene, uv: Float64[np.ndarray, "triangles 3 2"], chart: Int32[np.ndarray, " triangles"], resolution: int
+) -> Atlas:
+    """Measures every texel of a scene that is unwrapped.
+
+    Args:
+      scene: what is unwrapped.
+      uv: corners of each triangle in the unit square, origin top-left.
+      chart: of each triangle.
+      resolution: texels per side.
+    Raises:
+      UserError: no texel is covered.
+    """
     pieces = rasterise(uv * resolution, resolution)
     if len(pieces.texel) == 0:
         raise UserError(f'atlas.resolution: got {resolution}, but "{scene.name}" covers no texel; raise atlas.resolution')

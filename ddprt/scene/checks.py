@@ -6,7 +6,7 @@ a body is never turned inside out: a room is seen from inside, and only its make
 
 import numpy as np
 
-from ddprt.axes import Float, Int
+from ddprt.axes import Bool, Float, Int
 from ddprt.errors import UserError
 from ddprt.scene.material import Material
 from ddprt.scene.mesh import Scene
@@ -37,6 +37,8 @@ def checked(
     material: np.ndarray | None = None,
     materials: tuple[Material, ...] = (Material("plain", (UNSAID,) * 3),),
     uv: np.ndarray | None = None,
+    colour: np.ndarray | None = None,
+    lightmap: np.ndarray | None = None,
     notes: tuple[str, ...] = (),
 ) -> Scene:
     """Check raw arrays, mend what can be mended and make a `Scene` of them.
@@ -49,6 +51,8 @@ def checked(
       material: index into `materials` per triangle; all 0 if left out.
       materials: albedo and texture, each 0 to 1, linear.
       uv: (vertices, 2) texture coordinates, origin top-left; needed where a material has a texture.
+      colour: (vertices, 3) linear factors on the albedo, 0 to 1; 1 if left out.
+      lightmap: (vertices, 2) places on a lightmap of the file's own, NaN where it has none; judged when a scene is unwrapped.
       notes: what an importer has to say already.
     Returns:
       The scene; `notes` lists the repairs after those given.
@@ -72,11 +76,17 @@ def checked(
     if uv is not None:
         uv = np.asarray(_table(name, "uv", uv, 2, len(positions)), dtype=np.float64)
         _finite(name, "texture coordinate", uv, triangles)
+    if colour is not None:
+        colour = np.asarray(_table(name, "colour", colour, 3, len(positions)), dtype=np.float64)
+        if not ((colour >= 0) & (colour <= 1))[triangles].all():
+            raise UserError(f"{name}: got vertex colours that are not 0 to 1, expected linear factors; correct them")
+    if lightmap is not None:
+        lightmap = np.asarray(_table(name, "lightmap", lightmap, 2, len(positions)), dtype=np.float64)
 
     found = list(notes)
     triangles = triangles.astype(np.int64)
     weld = welded(positions)
-    keep = ~_negligible(positions[triangles])
+    keep = ~negligible(positions[triangles])
     if removed := np.count_nonzero(~keep):
         found.append(f"{removed} triangles of no area removed")
     repeated, backed = repeats(weld[triangles], keep)
@@ -103,7 +113,8 @@ def checked(
     triangles = triangles.reshape(-1, 3)
     if dropped := len(positions) - len(used):
         found.append(f"{dropped} vertices of no triangle dropped")
-    positions, uv = positions[used], None if uv is None else uv[used]
+    positions = positions[used]
+    uv, colour, lightmap = (None if rows is None else rows[used] for rows in (uv, colour, lightmap))
     given = None if normals is None else np.asarray(_table(name, "normals", normals, 3, len(weld)), dtype=np.float64)[used]
     unit, remark = _shading(positions, triangles, given)
     backs = _open_backs(weld[used][triangles], np.array([entry.two_sided for entry in materials])[material])
@@ -111,7 +122,7 @@ def checked(
         first = len(positions)
         own, corner = np.unique(triangles[backs], return_inverse=True)
         positions, unit = np.concatenate([positions, positions[own]]), np.concatenate([unit, -unit[own]])
-        uv = None if uv is None else np.concatenate([uv, uv[own]])
+        uv, colour, lightmap = (None if rows is None else np.concatenate([rows, rows[own]]) for rows in (uv, colour, lightmap))
         triangles = np.concatenate([triangles, first + corner.reshape(-1, 3)[:, ::-1]])
         material = np.concatenate([material, material[backs]])
         remark.append(f"{len(backs)} triangles of two-sided materials have a back of their own")
@@ -124,6 +135,8 @@ def checked(
         tuple(materials),
         uv,
         (*found, *remark),
+        colour=colour,
+        lightmap=lightmap,
     )
 
 
@@ -279,7 +292,8 @@ def _areas(corners: np.ndarray) -> np.ndarray:
     return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
 
 
-def _negligible(corners: np.ndarray) -> np.ndarray:
+def negligible(corners: Float[np.ndarray, "triangles 3 3"]) -> Bool[np.ndarray, " triangles"]:
+    """Triangles too low for the tracer, by the bounding box of all of them."""
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     diagonal = np.linalg.norm(np.ptp(corners.reshape(-1, 3), axis=0))
     return 2 * _areas(corners) <= NEGLIGIBLE * diagonal * longest

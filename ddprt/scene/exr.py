@@ -1,10 +1,12 @@
 """The only door to OpenEXR: contiguous arrays in, half floats that never overflow, files that are whole or absent."""
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ddprt.axes import Float
+from ddprt.axes import Float, Float32
 from ddprt.errors import UserError
 from ddprt.files import written_whole
 
@@ -75,6 +77,56 @@ def read_exr(path: Path) -> tuple[Float[np.ndarray, "height width channels"], di
             f"{path}: not a whole EXR image ({str(error).splitlines()[0]}); delete it and bake again, or copy it again"
         ) from None
     raise UserError(f"{path}: got channels {names}, expected RGB, RGBA or Y")
+
+
+@dataclass(frozen=True, eq=False)
+class Channels:
+    """All channels of an EXR, of all its parts.
+
+    Attributes:
+      planes: by full name, such as "R" or "ViewLayer.DiffDir.R"; row 0 at the top.
+      attributes: strings of the header.
+      chromaticities: x and y of red, green, blue and white, where the file tells them.
+    """
+
+    planes: dict[str, Float32[np.ndarray, "height width"]]
+    attributes: dict[str, str]
+    chromaticities: tuple[float, ...] | None
+
+
+def read_channels(path: Path) -> Channels:
+    """Reads an EXR that somebody else wrote: any channels, any number of parts.
+
+    Raises:
+      UserError: missing, damaged, cropped, or with channels of several sizes.
+    """
+    import OpenEXR
+
+    if not path.is_file():
+        raise UserError(f"{path}: got no file, expected an EXR image; check the path")
+    planes: dict[str, np.ndarray] = {}
+    header: dict[str, Any] = {}
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            for part in file.parts:
+                header = {**part.header, **header}
+                for name, channel in part.channels.items():
+                    full = name if name not in planes else f"{part.name()}.{name}"
+                    planes[full] = np.array(channel.pixels, np.float32)
+    except Exception as error:
+        what = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise UserError(f"{path}: not a whole EXR image ({what}); write it or copy it again") from None
+    data, display = (np.ravel(header[key]).tolist() for key in ("dataWindow", "displayWindow"))
+    if data != display:
+        raise UserError(f"{path}: got pixels {data} of a picture {display}, expected all of it; save it without cropping")
+    if len({plane.shape for plane in planes.values()}) != 1:
+        raise UserError(f"{path}: got channels of several sizes, expected one; save it without subsampling")
+    colours = header.get("chromaticities")
+    return Channels(
+        planes,
+        {key: value for key, value in header.items() if isinstance(value, str)},
+        None if colours is None else tuple(float(value) for value in colours),
+    )
 
 
 def exposure_for(peak: float) -> int:

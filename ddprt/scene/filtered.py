@@ -32,6 +32,8 @@ def mean_albedo(
         if entry.texture is not None and scene.uv is not None and len(chosen):
             corners = np.einsum("nkc,ncd->nkd", weights[chosen], scene.uv[scene.triangles[triangle[chosen]]])
             albedo[chosen] *= area_mean(entry.texture, corners)
+    if scene.colour is not None:  # linear over a piece, so that its middle is its mean
+        albedo *= np.einsum("nc,ncd->nd", weights.mean(1), scene.colour[scene.triangles[triangle]])
     return albedo
 
 

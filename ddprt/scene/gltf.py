@@ -4,8 +4,8 @@ Base colour factors are linear and base textures sRGB, as the standard says, and
 as W/(m² sr). Blended surfaces are taken as cut out where their opacity is below a half. A volume that light gets into and that
 scatters is a medium: its extinction is the volume's attenuation, its albedo what sends back the colour of multiple scattering
 where it is thick; its surface is smooth, whatever the roughness. All textures of a material are looked up at one place, the
-first one's: of another that has texture coordinates of its own the mean is taken, and said so. A primitive without normals is
-flat.
+first one's: of another that has texture coordinates of its own the mean is taken, and said so. Colours of vertices are linear
+factors on the albedo. A primitive without normals is flat. The second texture coordinates are kept as a lightmap layout.
 """
 
 import warnings
@@ -15,14 +15,17 @@ from typing import Any
 
 import numpy as np
 import pygltflib
-from scipy.spatial.transform import Rotation
 
 from ddprt.axes import Float, Float64, Int
 from ddprt.scene.accessors import Container, open_gltf
 from ddprt.scene.checks import UNSAID, checked
+from ddprt.scene.gltf_nodes import Pose, placed
+from ddprt.scene.gltf_primitive import colours_of, triangles_of
+from ddprt.scene.gltf_samplers import wraps
 from ddprt.scene.images import linear_image, plain_image
 from ddprt.scene.material import Cutout, Emission, Gloss, Material, Subsurface
 from ddprt.scene.mesh import Scene
+from ddprt.scene.wrapping import unrolled
 
 REFUSED = {
     "KHR_draco_mesh_compression": "export without Draco compression",
@@ -38,7 +41,7 @@ _PASSING = {
     "KHR_materials_transmission": "transmissionFactor",
     "KHR_materials_diffuse_transmission": "diffuseTransmissionFactor",
 }
-_STRENGTH = "KHR_materials_emissive_strength"
+_STRENGTH, _UNLIT, LIGHTS = "KHR_materials_emissive_strength", "KHR_materials_unlit", "KHR_lights_punctual"
 UNDERSTOOD = (
     *("KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp", _STRENGTH),
     *(_INDEX, _VOLUME, _SCATTER, *_PASSING),
@@ -55,45 +58,60 @@ def load_gltf(path: Path) -> Scene:
     Returns:
       The scene: metres, fronts as in the file (mirrored nodes keep theirs), one material per glTF material.
     Raises:
-      UserError: cut short, an index out of range, compressed geometry, sparse accessors, strips or fans. What else a damaged
-        file leads to is raised as it comes; `load_scene` puts it into words.
+      UserError: cut short, an index out of range, compressed geometry. What else a damaged file leads to is raised as it comes;
+        `load_scene` puts it into words.
     Reference: Khronos glTF 2.0 specification; KHR_mesh_quantization, KHR_texture_transform.
     """
     with warnings.catch_warnings():
         # pygltflib speaks by warnings; what matters in them is found and refused below.
         warnings.simplefilter("ignore")
-        return _Reader(open_gltf(path)).scene()
+        return Reader(open_gltf(path)).scene()
 
 
 @dataclass
 class _Part:
-    """One primitive in world space."""
+    """One primitive in world space; `lightmap` is its second set of texture coordinates, NaN where it has none."""
 
     positions: Float[np.ndarray, "vertices 3"]
     normals: Float[np.ndarray, "vertices 3"]
     uv: Float[np.ndarray, "vertices 2"]
+    colour: Float[np.ndarray, "vertices 3"]
+    lightmap: Float[np.ndarray, "vertices 2"]
     triangles: Int[np.ndarray, "triangles 3"]
     material: int
 
 
 @dataclass
-class _Reader:
+class Reader:
+    """One reading of a file: as it stands, or in a pose of its animation.
+
+    Attributes:
+      file: what is read.
+      pose: None leaves animations, skins and morph targets aside, and says so.
+    """
+
     file: Container
+    pose: Pose | None = None
     ignored: set[str] = field(default_factory=set)
     notes: list[str] = field(default_factory=list)
     images: dict[tuple[int, Any], np.ndarray] = field(default_factory=dict)
 
-    def scene(self) -> Scene:
+    def scene(self, *, numbered: bool = False) -> Scene:
+        """The checked scene; `numbered` has each vertex' number in `positions` where texture coordinates were."""
         self._extensions()
-        parts = [part for mesh, world in self._placed() for part in self._parts(mesh, world)]
-        if not parts:
-            raise self.file.fault("got no triangles, expected a mesh in the file's scene; export at least one")
+        parts = self._all_parts()
         starts = np.cumsum([0, *[len(part.positions) for part in parts]])
         numbers = sorted({part.material for part in parts})
         materials = tuple(self._material(number) for number in numbers)
-        self.ignored.update(
-            what for what, there in (("animations", self.file.json.animations), ("skins", self.file.json.skins)) if there
+        self._lamps()
+        still = (("animations", self.file.json.animations), ("skins", self.file.json.skins)) if self.pose is None else ()
+        self.ignored.update(what for what, there in (*still, ("cameras", self.file.json.cameras)) if there)
+        materials = tuple(
+            self._rolled_out(material, number, [part for part in parts if part.material == number])
+            for material, number in zip(materials, numbers, strict=True)
         )
+        colour = np.concatenate([part.colour for part in parts])
+        uv = np.concatenate([part.uv for part in parts]) if any(entry.textures for entry in materials) else None
         listed = [f"ignored in the file: {', '.join(sorted(self.ignored))}"] if self.ignored else []
         return checked(
             self.file.path.stem,
@@ -102,9 +120,22 @@ class _Reader:
             normals=np.concatenate([part.normals for part in parts]),
             material=np.concatenate([np.full(len(part.triangles), numbers.index(part.material)) for part in parts]),
             materials=materials,
-            uv=np.concatenate([part.uv for part in parts]) if any(entry.textures for entry in materials) else None,
+            uv=np.stack([np.arange(starts[-1], dtype=np.float64)] * 2, 1) if numbered else uv,
+            colour=colour if (colour != 1).any() else None,
+            lightmap=self._lightmap(parts),
             notes=(*self.notes, *listed),
         )
+
+    def positions(self) -> Float64[np.ndarray, "vertices 3"]:
+        """All vertices in world space, before any is dropped by the checks, metres."""
+        return np.concatenate([part.positions for part in self._all_parts()])
+
+    def _all_parts(self) -> list[_Part]:
+        nodes = placed(self.file, self.pose)
+        parts = [part for number, node, world in nodes if node.mesh is not None for part in self._parts(number, world)]
+        if not parts:
+            raise self.file.fault("got no triangles, expected a mesh in the file's scene; export at least one")
+        return parts
 
     def _extensions(self) -> None:
         required, used = set(self.file.json.extensionsRequired or []), set(self.file.json.extensionsUsed or [])
@@ -115,73 +146,50 @@ class _Reader:
                 raise self.file.fault(f"got the required extension {name}, which is not read; export without it")
         self.ignored.update(used - set(UNDERSTOOD))
 
-    def _placed(self) -> list[tuple[int, Float64[np.ndarray, "4 4"]]]:
-        """Meshes with their transforms to the world, in the order of the hierarchy."""
-        nodes, scenes = self.file.json.nodes, self.file.json.scenes
-        children = {child for node in nodes for child in node.children or []}
-        roots = (
-            self.file.entry("scenes", self.file.json.scene or 0).nodes
-            if scenes
-            else [n for n in range(len(nodes)) if n not in children]
-        )
-        placed, seen, waiting = [], set(), [(root, np.eye(4)) for root in reversed(roots)]
-        while waiting:
-            number, parent = waiting.pop()
-            if number in seen:
-                raise self.file.fault(f"got node {number} twice in the hierarchy, expected a tree; export it again")
-            seen.add(number)
-            node = self.file.entry("nodes", number)
-            world = parent @ _transform(node)
-            if node.mesh is not None:
-                placed.append((node.mesh, world))
-            waiting += [(child, world) for child in reversed(node.children or [])]
-        return placed
-
-    def _parts(self, mesh: int, world: Float64[np.ndarray, "4 4"]) -> list[_Part]:
+    def _parts(self, number: int, world: Float64[np.ndarray, "4 4"]) -> list[_Part]:
         parts = []
-        for primitive in self.file.entry("meshes", mesh).primitives:
+        for primitive in self.file.entry("meshes", self.file.entry("nodes", number).mesh).primitives:
             mode = 4 if primitive.mode is None else primitive.mode
             if mode in (0, 1, 2, 3):
                 self.ignored.add("points and lines")
                 continue
-            if mode != 4:
-                raise self.file.fault(f"got a triangle strip or fan (mode {mode}), expected triangle lists; triangulate it")
-            parts.append(self._part(primitive, world))
+            parts.append(self._part(number, primitive, world))
         return parts
 
-    def _part(self, primitive: Any, world: Float64[np.ndarray, "4 4"]) -> _Part:
+    def _part(self, number: int, primitive: Any, world: Float64[np.ndarray, "4 4"]) -> _Part:
         attributes = primitive.attributes
+        if attributes.POSITION is None:
+            raise self.file.fault("got a primitive without POSITION, expected places of vertices; export it again")
         positions = self.file.accessor(attributes.POSITION, 3)
         count = len(positions)
-        index = (
-            np.arange(count) if primitive.indices is None else self.file.accessor(primitive.indices, 1)[:, 0].astype(np.int64)
-        )
-        triangles = index[: len(index) // 3 * 3].reshape(-1, 3)
-        if triangles.size and triangles.max() >= count:
-            raise self.file.fault(f"got vertex index {triangles.max()}, expected 0 to {count - 1}; export it again")
-        flat = attributes.NORMAL is None
-        normals = np.full((count, 3), np.nan) if flat else self.file.accessor(attributes.NORMAL, 3)
-        uv = self._coordinates(primitive, count)
-        if primitive.targets:
+        triangles, left = triangles_of(self.file, primitive, count)
+        if left:
+            self.ignored.add("corners after the last whole triangle")
+        flat, second = attributes.NORMAL is None, getattr(attributes, "TEXCOORD_1", None)
+        normals = np.full((count, 3), np.nan) if flat else self._rows("NORMAL", attributes.NORMAL, 3, count)
+        uv, colour = self._coordinates(primitive, count), self._colour(primitive, count)
+        lightmap = np.full((count, 2), np.nan) if second is None else self._rows("TEXCOORD_1", second, 2, count)
+        if self.pose is not None:
+            as_modelled = positions
+            positions, world = self.pose.shaped(number, primitive, positions, world)
+            if positions is not as_modelled:  # the file's normals are of another shape: they are made anew
+                normals = np.full((count, 3), np.nan)
+        elif primitive.targets:
             self.ignored.add("morph targets")
-        if getattr(attributes, "COLOR_0", None) is not None:
-            self.ignored.add("vertex colours")
         linear = world[:3, :3]
         mirrored = np.linalg.det(linear) < 0
         # The cofactors are the inverse transpose up to a factor, and exist where the inverse does not.
         cofactors = np.cross(np.roll(linear, -1, axis=0), np.roll(linear, -2, axis=0)) * (-1 if mirrored else 1)
         if flat:
             corner = triangles.ravel()
-            positions, normals, uv, triangles = (
-                positions[corner],
-                normals[corner],
-                uv[corner],
-                np.arange(corner.size).reshape(-1, 3),
-            )
+            positions, normals, uv, colour, lightmap = (rows[corner] for rows in (positions, normals, uv, colour, lightmap))
+            triangles = np.arange(corner.size).reshape(-1, 3)
         return _Part(
             positions @ linear.T + world[:3, 3],
             normals @ cofactors.T,
             uv,
+            colour,
+            lightmap,
             triangles[:, ::-1] if mirrored else triangles,
             -1 if primitive.material is None else primitive.material,
         )
@@ -197,7 +205,55 @@ class _Reader:
             raise self.file.fault(f"got a texture but no {name}, expected texture coordinates; unwrap it or drop the texture")
         # As every viewer does; the listing in the extension's text has the sign the other way round (glTF issue 1563).
         turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-        return self.file.accessor(accessor, 2) * scale @ turn.T + offset
+        return self._rows(name, accessor, 2, count) * scale @ turn.T + offset
+
+    def _rows(self, name: str, number: int, width: int, count: int) -> Float64[np.ndarray, "count width"]:
+        """An attribute, of which every vertex must have its row."""
+        rows = self.file.accessor(number, width)
+        if len(rows) != count:
+            raise self.file.fault(f"got {len(rows)} rows of {name} for {count} vertices, expected as many; export it again")
+        return rows
+
+    def _colour(self, primitive: Any, count: int) -> Float64[np.ndarray, "vertices 3"]:
+        """Factors on the albedo of each vertex; 1 where the file has none."""
+        colour = colours_of(self.file, primitive)
+        if colour is None:
+            return np.ones((count, 3))
+        if len(colour) != count:
+            raise self.file.fault(f"got {len(colour)} colours for {count} vertices, expected as many; export it again")
+        if (colour[:, 3:] != 1).any():
+            self.ignored.add("opacity of vertex colours")
+        if (colour[:, :3] > 1).any():
+            self.notes.append("vertex colours above 1 are taken as 1")
+        return np.minimum(colour[:, :3], 1.0)
+
+    def _lamps(self) -> None:
+        """Says where the file's lights can be had: a scene holds what stays still."""
+        lamps = (self.file.json.extensions or {}).get(LIGHTS, {}).get("lights", [])
+        if lamps:
+            self.ignored.discard(LIGHTS)
+            self.notes.append(f"{len(lamps)} lights in the file: they shine where lightings.file names it")
+
+    def _lightmap(self, parts: list[_Part]) -> Float64[np.ndarray, "vertices 2"] | None:
+        """Second texture coordinates of all vertices; None where no primitive has any, NaN where some have none."""
+        lightmap = np.concatenate([part.lightmap for part in parts])
+        return None if np.isnan(lightmap).all() else lightmap
+
+    def _rolled_out(self, material: Material, number: int, parts: list[_Part]) -> Material:
+        """The material with its textures as their samplers wrap them; moves the texture coordinates of its parts."""
+        modes = {} if number < 0 or not material.textures else wraps(self.file, self.file.entry("materials", number))
+        uv = np.concatenate([part.uv for part in parts])
+        if not modes or not len(uv) or not np.isfinite(uv).all():
+            return material
+        changed = unrolled(material.textures, modes, uv)
+        if changed is None:
+            reach = np.abs(uv).max()
+            self.notes.append(f'material "{material.name}": texture coordinates up to {reach:g} are too far to wrap: repeated')
+            return material
+        start = 0
+        for part in parts:
+            part.uv, start = changed[1][start : start + len(part.uv)], start + len(part.uv)
+        return material.retextured(changed[0])
 
     def _material(self, number: int) -> Material:
         if number < 0:
@@ -211,7 +267,10 @@ class _Reader:
         )
         red, green, blue, alpha = (float(value) for value in base.baseColorFactor or [1.0] * 4)
         texture = None if base.baseColorTexture is None else self._image(base.baseColorTexture.index, linear_image)
-        medium = self._subsurface(entry, name)
+        medium, unlit = self._subsurface(entry, name), _UNLIT in (entry.extensions or {})
+        if unlit:
+            self.ignored.discard(_UNLIT)
+            self.notes.append(f'material "{name}" is unlit: taken as matt, lit as all others')
         return Material(
             name,
             (red, green, blue),
@@ -219,7 +278,7 @@ class _Reader:
             bool(entry.doubleSided),
             self._cutout(entry, name, alpha),
             self._emission(entry, name),
-            None if medium else self._gloss(entry, name),
+            None if medium or unlit else self._gloss(entry, name),
             medium,
         )
 
@@ -293,18 +352,19 @@ class _Reader:
         source = webp if webp is not None else texture.source
         if source is None:
             raise self.file.fault(f"got texture {number} without an image, expected PNG or JPEG; export textures as PNG")
-        if texture.sampler is not None:
-            sampler = self.file.entry("samplers", texture.sampler)
-            if {sampler.wrapS, sampler.wrapT} - {None, 10497}:
-                self.ignored.add("texture wrap modes other than repeat")
         if (source, kind) in self.images:
             return self.images[source, kind]
         image = self.file.entry("images", source)
         try:
             data = bytes(self.file.view(image.bufferView)) if image.uri is None else self.file.uri(image.uri)
+            if data[:6] == b"\xabKTX 2":
+                raise self.file.fault(f"got image {source} as KTX2, which is not read; export textures as PNG")
             self.images[source, kind] = kind(data)
         except OSError as problem:
-            raise self.file.fault(f"got image {source} that cannot be read ({problem}); export textures as PNG") from problem
+            why = str(problem).partition("<")[0].strip()  # Pillow adds an address
+            raise self.file.fault(
+                f"got image {source} that cannot be read ({why}), expected PNG or JPEG; export it again"
+            ) from problem
         return self.images[source, kind]
 
 
@@ -323,14 +383,7 @@ def _placing(texture: Any) -> tuple[int, float, list[float], list[float]]:
     """Number of its texture coordinates, and how they are turned, scaled and moved."""
     change = (texture.extensions or {}).get("KHR_texture_transform", {})
     number = change.get("texCoord", texture.texCoord or 0)
-    return number, change.get("rotation", 0.0), change.get("scale", [1.0, 1.0]), change.get("offset", [0.0, 0.0])
-
-
-def _transform(node: Any) -> Float64[np.ndarray, "4 4"]:
-    """A node's matrix; glTF stores matrices by columns and applies scale, then rotation, then translation."""
-    if node.matrix is not None:
-        return np.array(node.matrix, dtype=np.float64).reshape(4, 4).T
-    local = np.eye(4)
-    local[:3, :3] = Rotation.from_quat(node.rotation or [0.0, 0.0, 0.0, 1.0]).as_matrix() * (node.scale or [1.0, 1.0, 1.0])
-    local[:3, 3] = node.translation or [0.0, 0.0, 0.0]
-    return local
+    scale, offset = (
+        [float(value) for value in change.get(key, default)] for key, default in (("scale", (1, 1)), ("offset", (0, 0)))
+    )
+    return number, float(change.get("rotation", 0.0)), scale, offset

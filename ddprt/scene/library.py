@@ -3,6 +3,7 @@
 import inspect
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,10 +11,12 @@ from ddprt.catalogue import Catalogue
 from ddprt.errors import UserError, nearest
 from ddprt.scene.checks import checked, vertex_normals
 from ddprt.scene.cornell import cornell, cornell_hole
+from ddprt.scene.fog import Fog
 from ddprt.scene.furball import furball
 from ddprt.scene.lion import lion
 from ddprt.scene.material import Cutout, Emission, Gloss, Material, Subsurface
 from ddprt.scene.mesh import Scene
+from ddprt.scene.motions import bending
 from ddprt.scene.shapes import box, faceted, hollow, icosphere, rectangle
 
 
@@ -149,6 +152,31 @@ def statue_marble(
         material=of_stone.material,
         materials=(marble, of_stone.materials[1]),
     )
+
+
+def foggy_room(*, mean_free_path: float = 0.5, albedo: float = 0.95, anisotropy: float = 0.3, brightness: float = 1.0) -> Scene:
+    """The Cornell box in fog, which light scatters in before it reaches a wall, and beams of spots show in.
+
+    Args:
+      mean_free_path: of green light in it, metres; red goes a fifth further, blue a fifth less.
+      albedo: of single scattering.
+      anisotropy: mean cosine of the angle of scattering.
+      brightness: of the walls, as a share of what was published; 0 paints them black.
+    Raises:
+      UserError: fog that cannot be, or walls brighter than that.
+    """
+    if brightness > 1:
+        raise UserError(f"foggy-room.brightness: got {brightness:g}, expected 0 to 1; lower it")
+    paths = (1.2 * mean_free_path, mean_free_path, 0.8 * mean_free_path)
+    fog = Fog.of({"mean_free_path": paths, "albedo": albedo, "anisotropy": anisotropy}, "foggy-room")
+    room = cornell()
+    room = room.made_of(lambda wall: _darker(wall, brightness)) if brightness < 1 else room
+    return replace(room, name="foggy-room", fog=fog)
+
+
+def _darker(material: Material, share: float) -> Material:
+    red, green, blue = (share * own for own in material.albedo)
+    return replace(material, albedo=(red, green, blue))
 
 
 def convex(*, albedo: float = 0.8, size: float = 1.0) -> Scene:
@@ -335,6 +363,8 @@ SCENES: Catalogue[Callable[..., Scene]] = Catalogue(
         "neon": neon,
         "lion": lion,
         "furball": furball,
+        "foggy-room": foggy_room,
+        "bending": bending,
     },
 )
 

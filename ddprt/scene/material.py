@@ -3,8 +3,10 @@
 So a scene says by itself which effects it calls for: one without a `Cutout` has no holes to look for.
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -158,6 +160,16 @@ class Material:
         found |= {"opacity": self.cutout.opacity} if self.cutout else {}
         return {name: image for name, image in found.items() if image is not None}
 
+    def retextured(self, images: Mapping[str, np.ndarray]) -> "Material":
+        """The same with other images, by the names of `textures`."""
+        lit = {"emission": self.emission, "gloss": self.gloss}
+        changed: dict[str, Any] = {
+            name: replace(part, texture=images[name]) for name, part in lit.items() if part and name in images
+        }
+        if self.cutout:
+            changed["cutout"] = replace(self.cutout, opacity=images["opacity"])
+        return replace(self, texture=images.get("albedo"), **changed)
+
 
 def bilinear(image: Float[np.ndarray, "height width ..."], uv: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n ..."]:
     """Repeating bilinear lookup, texel centres at half-integers."""
@@ -170,3 +182,8 @@ def bilinear(image: Float[np.ndarray, "height width ..."], uv: Float[np.ndarray,
     top = image[y0, x0] * (1 - fx) + image[y0, x1] * fx
     bottom = image[y1, x0] * (1 - fx) + image[y1, x1] * fx
     return top * (1 - fy) + bottom * fy
+
+
+def plain(material: Material) -> Material:
+    """The same surface with its one albedo alone."""
+    return Material(material.name, material.albedo)

@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from ddprt.axes import Float, Float32, Float64, Int, Int32
+from ddprt.scene.fog import Fog
 from ddprt.scene.material import Material, bilinear
 
 SIDES = 3
@@ -59,6 +60,10 @@ class Scene:
       forced: effects that a user wants simulated whatever the materials say.
       refused: effects that a user wants left out likewise.
       tubes: strands, of which the last triangles are; None where there are none.
+      colour: linear factor on the albedo per vertex, 0 to 1, or None where it is 1 everywhere.
+      lightmap: where the file would have each vertex on a lightmap, unchecked; see `ddprt.scene.own_charts`.
+      fog: what fills the bounding box; None for clear air.
+      rest: the pose of an animation that this one's lightmap is unwrapped on; None where nothing moves.
     """
 
     name: str
@@ -73,6 +78,10 @@ class Scene:
     forced: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
     tubes: Tubes | None = None
+    colour: Float64[np.ndarray, "vertices 3"] | None = None
+    lightmap: Float64[np.ndarray, "vertices 2"] | None = None
+    fog: Fog | None = None
+    rest: "Scene | None" = None
 
     @cached_property
     def corners(self) -> Float64[np.ndarray, "triangles 3 3"]:
@@ -111,12 +120,15 @@ class Scene:
 
     @cached_property
     def digest(self) -> str:
-        """Hash of geometry and materials: equal digests bake equal light."""
+        """Hash of geometry, materials and fog: equal digests bake equal light."""
         state = hashlib.sha256()
         arrays = [self.positions, self.triangles, self.normals, self.material, self.uv]
         for array in [*arrays, *(material.texture for material in self.materials)]:
             if array is not None:
                 state.update(str(array.shape).encode() + np.ascontiguousarray(array).tobytes())
+        for name, rows in (("colour", self.colour), ("lightmap", self.lightmap)):
+            if rows is not None:
+                state.update(f"{name} {rows.shape}".encode() + np.ascontiguousarray(rows).tobytes())
         state.update(repr([material.albedo for material in self.materials]).encode())
         for index, material in enumerate(self.materials):
             for part in (material.cutout, material.emission, material.gloss, material.subsurface, material.fibre):
@@ -128,6 +140,8 @@ class Scene:
         state.update(repr(self.forced).encode() if self.forced else b"")
         if self.tubes is not None:
             state.update(f"{self.tubes.axis.shape}".encode() + self.tubes.radius.tobytes() + self.tubes.colour.tobytes())
+        state.update(f"{self.fog}".encode() if self.fog else b"")
+        state.update(b"" if self.rest is None else f"rest {self.rest.digest}".encode())
         return state.hexdigest()[:16]
 
     @cached_property
@@ -150,6 +164,8 @@ class Scene:
         """Linear albedo at points given by triangle and weights of its three corners."""
         material = self.material[triangle]
         albedo = np.array([entry.albedo for entry in self.materials])[material]
+        if self.colour is not None:
+            albedo *= np.einsum("nc,ncd->nd", barycentric, self.colour[self.triangles[triangle]])
         if self.uv is None:
             return albedo
         uv = self.uv_at(triangle, barycentric)

@@ -18,16 +18,19 @@ from ddprt.axes import Float, Int
 from ddprt.errors import UserError
 from ddprt.scene.checks import UNSAID, checked
 from ddprt.scene.images import linear_image, srgb_to_linear
-from ddprt.scene.material import Material
+from ddprt.scene.material import Material, plain
 from ddprt.scene.mesh import Scene
 
 EXACT_COLOURS = 4096
 """Different colours that each become a material; where a file has more, they are rounded to 32 levels per channel."""
 
 
-def load_polygons(path: Path) -> Scene:
+def load_polygons(path: Path, *, lightmap: bool = False) -> Scene:
     """Read an .obj (with its .mtl and textures beside it), .ply or .stl.
 
+    Args:
+      path: of the file.
+      lightmap: its texture coordinates are those of a lightmap; materials keep their one albedo.
     Returns:
       The scene; its notes say what was assumed and which files are missing.
     Raises:
@@ -48,6 +51,8 @@ def load_polygons(path: Path) -> Scene:
             number[entry.name] = len(materials)
             materials.append(entry)
     starts = np.cumsum([0, *[len(part.positions) for part in parts]])
+    if lightmap:
+        materials = [plain(entry) for entry in materials]
     return checked(
         path.stem,
         np.concatenate([part.positions for part in parts]),
@@ -56,6 +61,7 @@ def load_polygons(path: Path) -> Scene:
         material=np.concatenate([np.array([number[entry.name] for entry in part.materials])[part.material] for part in parts]),
         materials=tuple(materials),
         uv=np.concatenate([part.uv for part in parts]) if any(entry.texture is not None for entry in materials) else None,
+        lightmap=np.concatenate([part.uv for part in parts]) if lightmap else None,
         notes=tuple(dict.fromkeys([*notes, *[note for part in parts for note in part.notes]])),
     )
 

@@ -45,6 +45,8 @@ def without_backs(scene: Scene) -> Scene:
         normals=scene.normals[used],
         material=scene.material[kept],
         uv=None if scene.uv is None else scene.uv[used],
+        colour=None if scene.colour is None else scene.colour[used],
+        lightmap=None if scene.lightmap is None else scene.lightmap[used],
     )
 
 

@@ -101,6 +101,8 @@ def with_strands(scene: Scene | None, name: str, strands: Strands, material: Mat
         material=np.concatenate([scene.material, kind + np.int32(len(scene.materials))]),
         materials=(*scene.materials, material),
         uv=None if scene.uv is None else np.concatenate([scene.uv, np.zeros((len(positions), 2))]),
+        colour=None if scene.colour is None else np.concatenate([scene.colour, np.ones((len(positions), 3))]),
+        lightmap=None if scene.lightmap is None else np.concatenate([scene.lightmap, np.zeros((len(positions), 2))]),
         tubes=tubes,
     )
 
@@ -120,6 +122,8 @@ def bald(scene: Scene) -> Scene | None:
         normals=scene.normals[:used],
         material=scene.material[:kept],
         uv=None if scene.uv is None else scene.uv[:used],
+        colour=None if scene.colour is None else scene.colour[:used],
+        lightmap=None if scene.lightmap is None else scene.lightmap[:used],
         tubes=None,
         whole=None,
     )

@@ -1,4 +1,4 @@
-"""Charts by xatlas, packed to exactly the resolution that was asked for, remembered by mesh hash."""
+"""Charts by xatlas, packed to exactly the resolution that was asked for, remembered by mesh hash; or the file's own."""
 
 import hashlib
 import tempfile
@@ -13,6 +13,7 @@ from ddprt.errors import UserError
 from ddprt.files import cache_folder
 from ddprt.scene.folds import folded
 from ddprt.scene.mesh import Scene
+from ddprt.scene.own_charts import fault_of, own_charts
 from ddprt.scene.patches import Patches, cut, hard_parts
 from ddprt.scene.winding import welded
 
@@ -26,10 +27,10 @@ _FORMAT = "2"  # part of the cache key: raise it when the unwrapping changes
 def unwrap(
     scene: Scene, resolution: int, padding: int
 ) -> tuple[Float64[np.ndarray, "triangles 3 2"], Int32[np.ndarray, " triangles"]]:
-    """Lightmap coordinates of every triangle corner.
+    """Lightmap coordinates of every triangle corner: the scene's own where it has sound ones, else new ones.
 
     Args:
-      scene: what to unwrap.
+      scene: what to unwrap; of a pose its rest pose, so that charts stay on the mesh as it moves.
       resolution: texels per side; the packing fills exactly this square.
       padding: empty texels between charts.
     Returns:
@@ -37,6 +38,9 @@ def unwrap(
     Raises:
       UserError: the charts cannot be packed into so few texels.
     """
+    scene = scene.rest or scene
+    if scene.lightmap is not None and not fault_of(scene, resolution, padding):
+        return own_charts(scene)
     key = hashlib.sha256(f"{_FORMAT} {scene.digest} {resolution} {padding} {xatlas.__version__}".encode()).hexdigest()[:24]
     path = cache_folder() / f"unwrap-{key}.npz"
     try:

@@ -173,8 +173,9 @@ def direct_irradiance(
 
 
 def centred(tracer: Tracer, lighting: Lighting) -> Lighting:
-    """The lighting in the tracer's frame."""
-    return tuple(light.translated(-tracer.centre) for light in lighting)
+    """The lighting in the tracer's frame, as it is seen through the fog there if there is some."""
+    there = tuple(light.translated(-tracer.centre) for light in lighting)
+    return tuple(map(tracer.medium.veiled, there)) if tracer.medium else there
 
 
 def _add(

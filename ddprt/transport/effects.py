@@ -17,18 +17,16 @@ from ddprt.config import Config
 from ddprt.errors import UserError
 from ddprt.lights import LIGHTS, Lighting, parse_lighting
 from ddprt.progress import amount
-from ddprt.scene.files import load_scene
 from ddprt.scene.holes import pierced
 from ddprt.scene.material import Material
 from ddprt.scene.mesh import Scene
 from ddprt.scene.sheets import backs, without_backs
 from ddprt.sections import TransportConfig
+from ddprt.transport.convexity import sees_nothing
+from ddprt.transport.fogginess import foggy
 from ddprt.transport.glossiness import glossy, lobe_left, worth_gloss
 from ddprt.transport.hairiness import diffuse, hairy
 from ddprt.transport.translucency import filled, opaque
-
-_FLAT = 1e-6  # of the radius: how far a corner may stand before a triangle's plane and still be in it
-_CHUNK = 1 << 22
 
 
 @dataclass(frozen=True)
@@ -203,11 +201,6 @@ def force(scene: Scene, *, on: Sequence[str] = (), off: Sequence[str] = ()) -> S
     return replace(left, whole=whole if left is not whole else None, refused=tuple(sorted(refused)))
 
 
-def configured_scene(config: Config) -> Scene:
-    """The scene of a configuration, with the effects that it forces."""
-    return force(load_scene(config.scene.name, **config.scene.parameters), on=config.effects.on, off=config.effects.off)
-
-
 def _decided(name: str, entry: Entry, question: Question) -> Effect:
     """What is forced off is judged by the whole scene; no entry's judgement knows what is forced."""
     scene = question.scene
@@ -225,16 +218,17 @@ def _decided(name: str, entry: Entry, question: Question) -> Effect:
 def _diffuse_bounces(name: str, question: Question) -> Effect:
     bounces = question.bounces
     brightest = max(map(opaque, question.scene.used_materials), key=lambda material: material.brightest)
-    albedo, inside = brightest.brightest, any(filled(question.scene)) or hairy(question.scene)
-    if albedo == 0 and not any(glossy(question.scene)) and not hairy(question.scene):
+    albedo, misty = brightest.brightest, foggy(question.scene)
+    inside = any(filled(question.scene)) or hairy(question.scene) or misty
+    if albedo == 0 and not any(glossy(question.scene)) and not hairy(question.scene) and not misty:
         return Effect(name, False, "every material is black")
-    if question.scene.tubes is None and sees_nothing(question.scene):
+    if question.scene.tubes is None and not misty and sees_nothing(question.scene):
         return Effect(name, False, "no surface faces another: the scene is convex seen from outside")
     if bounces >= 0:
         glows = any(_brightest(material) for material in question.scene.used_materials)  # with lamps however dim
         left = albedo ** (bounces + 1) / (1 - albedo) if albedo < 1 and not (glows or inside) else None
         return Effect(name, bounces > 0, f"forced to {bounces} (largest albedo {albedo:.3g})", left, True)
-    why = f'largest albedo {albedo:.3g} ("{brightest.name}"), and surfaces face each other'
+    why = f'largest albedo {albedo:.3g} ("{brightest.name}"), and {"fog is about" if misty else "surfaces face each other"}'
     if albedo >= 1:
         return Effect(name, True, f"{why}; where they close it in, light never dies away: lower it", None)
     return Effect(name, True, why)
@@ -342,6 +336,14 @@ def _hair(name: str, question: Question) -> Effect:
     return Effect(name, True, f"{len(tubes.axis)} strands of {question.users(lambda entry: entry.fibre)}")
 
 
+def _fog(name: str, question: Question) -> Effect:
+    fog = question.scene.fog
+    if fog is None or not foggy(question.scene):
+        return Effect(name, False, "the air is clear" if fog is None else "the bounding box is flat and holds no air")
+    paths = 2 * question.scene.radius / min(fog.mean_free_path)
+    return Effect(name, True, f"the scene is up to {paths:.3g} free paths wide, its fog's largest albedo {max(fog.albedo):.3g}")
+
+
 def _probes(name: str, question: Question) -> Effect:
     asked = question.probes
     return Effect(name, bool(asked), f"the configuration asks for {asked}" if asked else "the configuration asks for none")
@@ -376,18 +378,15 @@ EFFECTS: Catalogue[Entry] = Catalogue(
             lambda scene: scene.made_of(diffuse),
             cost=lambda question: "as many paths as the noise that is asked for takes, which go from strand to strand",
         ),
+        "fog": Entry(
+            _fog,
+            "fog",
+            lambda scene: replace(scene, fog=None),
+            cost=lambda question: "as many paths as the noise that is asked for takes, lit all along their way by each lamp",
+        ),
         "probes": Entry(_probes, "probes", lambda scene: scene, lambda question: 0.0),  # no lightmap has light from them
+        "animation": Entry(
+            lambda name, asked: Effect(name, bool(asked.scene.rest), "a pose" if asked.scene.rest else "static")
+        ),
     },
 )
-
-
-def sees_nothing(scene: Scene) -> bool:
-    """Whether no corner of the scene stands in front of any triangle's plane: then nothing can be gathered."""
-    corners = np.unique(scene.corners.reshape(-1, 3), axis=0) - scene.centre
-    height = np.einsum("nd,nd->n", scene.geometric_normals, scene.corners[:, 0] - scene.centre)
-    step = max(1, _CHUNK // len(corners))
-    for first in range(0, len(height), step):
-        chunk = slice(first, first + step)
-        if (corners @ scene.geometric_normals[chunk].T > height[chunk] + _FLAT * scene.radius).any():
-            return False
-    return True

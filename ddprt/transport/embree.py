@@ -19,6 +19,7 @@ import numpy as np
 from ddprt import warp
 from ddprt.axes import Bool, Float32, Float64, Int32
 from ddprt.scene.distance import distance_within
+from ddprt.scene.fog import Fog
 from ddprt.scene.holes import Holes
 from ddprt.scene.mesh import Scene
 from ddprt.scene.sheets import back_to_back
@@ -59,11 +60,18 @@ class Tracer:
       corners: triangle corners, world space, metres.
       threads: workers of `map`; 0 takes one per core.
       holes: where rays pass through triangles, if anywhere.
+      fog: what fills the bounding box; None for clear air.
     Raises:
       UserError: embreex is missing (there is no slow fallback).
     """
 
-    def __init__(self, corners: Float64[np.ndarray, "triangles 3 3"], threads: int = 0, holes: Holes | None = None) -> None:
+    def __init__(
+        self,
+        corners: Float64[np.ndarray, "triangles 3 3"],
+        threads: int = 0,
+        holes: Holes | None = None,
+        fog: Fog | None = None,
+    ) -> None:
         self._world, self._boxes = corners, np.stack([corners.min(1), corners.max(1)], 1)
         low, high = self._boxes[:, 0].min(0), self._boxes[:, 1].max(0)
         self.centre = (low + high) / 2
@@ -85,11 +93,16 @@ class Tracer:
             from ddprt.transport.cutouts import Openwork
 
             self.openwork = Openwork(holes, traced, self.offset, self._count)
+        self.medium: Any = None
+        if fog is not None:
+            from ddprt.transport.medium import Medium
+
+            self.medium = Medium.of(fog, (high - low) / 2)
 
     @classmethod
     def of(cls, scene: Scene, threads: int = 0) -> "Tracer":
         """The tracer of a scene."""
-        return cls(scene.corners, threads, Holes.of(scene))
+        return cls(scene.corners, threads, Holes.of(scene), scene.fog)
 
     def closest(self, origins: Float32[np.ndarray, "rays 3"], directions: Float32[np.ndarray, "rays 3"]) -> Hits:
         """First surface along each ray (centred frame, unit directions)."""

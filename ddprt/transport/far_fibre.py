@@ -25,6 +25,7 @@ import numpy as np
 
 from ddprt.axes import Bool, Float, Float32, Float64, Int32
 from ddprt.compiled import compiled
+from ddprt.lights import Light
 from ddprt.scene.material import Fibre
 from ddprt.transport import fibre
 from ddprt.transport.walk import Vertices
@@ -165,6 +166,10 @@ class FarVertices:
             own = self.record[part], self.rows[part], self.held[part], self.close[part]
             yield FarVertices(there, *own, self.shape, self.far)
             first = part.stop
+
+    def under(self, light: Light, start: Float32[np.ndarray, "3"]) -> "FarVertices":
+        """Where the light of one lamp is asked for: here, whichever it is."""
+        return self
 
     def lit_from(self, directions: Float32[np.ndarray, "n 3"]) -> Vertices:
         """What each W/m² that arrives from directions, on a plane that faces it, is worth to the receivers.

@@ -12,6 +12,7 @@ import numpy as np
 
 from ddprt import warp
 from ddprt.axes import Bool, Float32, Int, Int32
+from ddprt.lights import Light
 from ddprt.scene.material import Material, bilinear
 from ddprt.scene.mesh import Scene
 from ddprt.transport import ggx, weighing
@@ -96,6 +97,10 @@ class GlossyVertices:
         for there in self.there.blocks():
             yield GlossyVertices(there, self.lobes.part(slice(first, first + len(there.owner))))
             first += len(there.owner)
+
+    def under(self, light: Light, start: Float32[np.ndarray, "3"]) -> "GlossyVertices":
+        """Where the light of one lamp is asked for: here, whichever it is."""
+        return self
 
     def lit_from(self, directions: Float32[np.ndarray, "n 3"]) -> Vertices:
         """What each W/m² that arrives from directions is worth to the receivers."""

@@ -13,6 +13,7 @@ from ddprt.errors import UserError
 from ddprt.scene.material import Gloss, Material
 from ddprt.scene.mesh import Scene
 from ddprt.transport.embree import Tracer
+from ddprt.transport.fogginess import foggy
 from ddprt.transport.hairiness import hairy, refuse_hairy
 
 
@@ -48,11 +49,11 @@ def scattering(scene: Scene) -> Scene:
 
 
 def valid_integrator(asked: str, scene: Scene) -> str:
-    """The cheapest integrator that is valid for a scene's materials, where "auto" is asked for; else the one asked for.
+    """The cheapest integrator that is valid for a scene, where "auto" is asked for; else the one asked for.
 
     Raises:
-      UserError: the operator, which takes surfaces as diffuse, for a scene with gloss or hair, or the reference for hair.
-        Leaving these out is the user's to say, so that the plan tells of it.
+      UserError: the operator, which knows diffuse surfaces and clear air, for a scene with gloss, hair or fog, or the reference
+        for hair. Leaving these out is the user's to say, so that the plan tells of it.
     """
     users = [f'"{entry.name}"' for entry, chosen in zip(scene.materials, glossy(scene), strict=True) if chosen]
     if users and asked == "operator":
@@ -62,7 +63,12 @@ def valid_integrator(asked: str, scene: Scene) -> str:
         )
     if asked in ("operator", "reference"):
         refuse_hairy(scene, f'transport.integrator = "{asked}"', 'set transport.integrator = "auto"')
-    return ("paths" if users or hairy(scene) else "operator") if asked == "auto" else asked
+    if asked == "operator" and foggy(scene):
+        raise UserError(
+            'transport.integrator: got "operator", which sees through fog, for a scene with fog; expected "auto", "paths" or '
+            '"reference", or effects.off = ["fog"]'
+        )
+    return ("paths" if users or hairy(scene) or foggy(scene) else "operator") if asked == "auto" else asked
 
 
 GRAZING = (1.0, 0.85, 0.62, 0.43, 0.29, 0.2, 0.14, 0.1, 0.075, 0.06, 0.05)

@@ -56,8 +56,9 @@ def irradiance(
     parsed = parse_lighting(lighting)
     tracer = Tracer.of(scene)
     # A probe may float in free air, where even a convex scene sends light to it: only black scenes end at direct light, if
-    # they do not gloss.
-    black = all(material.brightest == 0 for material in scene.materials) and not any(glossy(scene))
+    # they do not gloss, and no fog is about.
+    dull = all(material.brightest == 0 for material in scene.materials) and not any(glossy(scene))
+    black = dull and not tracer.medium
     start = on_points(tracer, place, facing)
     estimate = trace_reference(tracer, scene, parsed, start, len(place), samples, seed=seed, bounces=0 if black else -1)
     if return_variance:

@@ -13,6 +13,7 @@ their grain, as those of the operator do.
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -24,8 +25,9 @@ from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
 from ddprt.transport.direct import centred
 from ddprt.transport.embree import Tracer
+from ddprt.transport.fogginess import refuse_fog_beside
 from ddprt.transport.gather import Receivers
-from ddprt.transport.glossiness import glossy_surfaces
+from ddprt.transport.glossiness import glossy, glossy_surfaces
 from ddprt.transport.hairiness import strands_of
 from ddprt.transport.shading import shade, shift
 from ddprt.transport.translucency import refuse_filled
@@ -89,6 +91,8 @@ def follow(
 ) -> Iterator[int]:
     """The same with light of any kind: `shading` tells what vertices are worth."""
     refuse_filled(scene, "unbiased paths")
+    refuse_fog_beside(scene, any(glossy(scene)))
+    air = import_module("ddprt.transport.fog").Air(tracer.medium) if tracer.medium else None
     receivers = Receivers.texels(atlas, samples, seed, f"{stream} paths", texels)
     albedo, hair = albedo_of(scene), strands_of(tracer, scene)
     gloss = hair or glossy_surfaces(tracer, scene)
@@ -101,7 +105,7 @@ def follow(
             sums = np.zeros((len(out), tile.stop - tile.start, 3))
             for start, triangle in starts(tracer, receivers, tile):
                 begun = hair.begun(*start[:2], triangle) if hair else None
-                for met in walked(tracer, albedo, start, walk, bounces, gloss, begun):
+                for met in walked(tracer, albedo, start, walk, bounces, gloss, begun, air):
                     for part in met.blocks():
                         shading(part, chance, sums)
             with np.errstate(over="ignore"):  # what is not finite is refused where light is stored

@@ -7,6 +7,8 @@ hit sends L = albedo * E_hit / pi; so one path contributes the sum over its vert
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -18,7 +20,8 @@ from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
 from ddprt.transport.direct import centred, direct_irradiance
 from ddprt.transport.embree import Tracer, lifted
-from ddprt.transport.glossiness import glossy_surfaces
+from ddprt.transport.fogginess import refuse_fog_beside
+from ddprt.transport.glossiness import glossy, glossy_surfaces
 from ddprt.transport.hairiness import refuse_hairy
 from ddprt.transport.translucency import refuse_filled
 
@@ -63,7 +66,10 @@ def trace_reference(
     """
     refuse_hairy(scene, "the reference", "use transport.trace_paths,")
     refuse_filled(scene, "unbiased paths")
-    lights, gloss = centred(tracer, lighting), glossy_surfaces(tracer, scene)
+    refuse_fog_beside(scene, any(glossy(scene)))
+    lights = centred(tracer, lighting)
+    foggy = import_module("ddprt.transport.fog_reference").paths if tracer.medium else None
+    trace = foggy or partial(_paths, gloss=glossy_surfaces(tracer, scene))
     block = max(1, _BATCH // samples)
     rounds = -(-samples // _BATCH)
 
@@ -74,7 +80,7 @@ def trace_reference(
             rng = seeds.stream(seed, "reference", first, turn)
             paths = min(_BATCH, samples - turn * _BATCH)
             index = np.repeat(np.arange(first, first + count), paths)
-            values = np.stack(_paths(tracer, scene, lights, start(index, rng), rng, bounces, gloss), 1)
+            values = np.stack(trace(tracer, scene, lights, start(index, rng), rng, bounces), 1)
             values = values.reshape(count, paths, 2, 3).astype(np.float64)
             sums += values.sum(1)
             squares += (values**2).sum(1)

@@ -42,13 +42,14 @@ def shade(
             if not light.delta:
                 np.add(numbers[:2], start[:2, None], out=u)
                 u -= u >= 1
-            sample = light.illuminate(vertices.place[:3].T, u.T, sample, vertices.facing)
+            there = vertices.under(light, start)
+            sample = light.illuminate(there.place[:3].T, u.T, sample, there.facing)
             if not any(sample.colour):
                 continue
-            there = sample.direction.T, sample.distance, sample.strength
-            lit = vertices.lit_from(sample.direction)
+            arriving_from = sample.direction.T, sample.distance, sample.strength
+            lit = there.lit_from(sample.direction)
             chance = lit.brightness, numbers[2], start[2]
-            rays = _aim(lit.place, *there, tracer.offset, *chance, weight, target, origins, directions, reach)
+            rays = _aim(lit.place, *arriving_from, tracer.offset, *chance, weight, target, origins, directions, reach)
             if rays:
                 seen = tracer.unoccluded(origins[:rays], directions[:rays], reach[:rays])
                 arriving = seen, target, weight, lit.throughput, lit.owner, sample.colour, total

@@ -11,6 +11,7 @@ import numpy as np
 from ddprt import warp
 from ddprt.axes import Float32, Int32
 from ddprt.compiled import compiled
+from ddprt.lights import Light
 from ddprt.scene.mesh import Scene
 from ddprt.transport.direct import BLOCK
 from ddprt.transport.embree import Tracer, lifted
@@ -27,6 +28,9 @@ Albedo = Callable[[Int32[np.ndarray, " n"], np.ndarray, np.ndarray], Float32[np.
 
 Gloss = Any
 """What `ddprt.transport.gloss.Surfaces` or `ddprt.transport.hair.Hair` is; not imported where there is none."""
+
+Air = Any
+"""A `ddprt.transport.fog.Air`, likewise."""
 
 Rays = tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"], Int32[np.ndarray, " n"]]
 """Origins, directions, and the receiver that each belongs to."""
@@ -55,6 +59,10 @@ class Vertices:
     def facing(self) -> Float32[np.ndarray, "n 3"]:
         """The normals."""
         return self.place[3:].T
+
+    def under(self, light: Light, start: Float32[np.ndarray, "3"]) -> "Vertices":
+        """Where the light of one lamp is asked for: here, whichever it is."""
+        return self
 
     def lit_from(self, directions: Float32[np.ndarray, "n 3"]) -> "Vertices":
         """What each W/m² that arrives from directions is worth to the receivers: the same from all."""
@@ -94,6 +102,10 @@ class Meetings(Protocol):
         """Normals of the half-spaces that light comes from; None where it comes from all sides."""
         ...
 
+    def under(self, light: Light, start: Float32[np.ndarray, "3"]) -> "Meetings":
+        """Where the light of one lamp (centred frame) is asked for; its random numbers start there."""
+        ...
+
     def lit_from(self, directions: Float32[np.ndarray, "n 3"]) -> Vertices:
         """What each W/m² that arrives from directions is worth to the receivers, and where its shadow rays start."""
         ...
@@ -104,8 +116,9 @@ class Meetings(Protocol):
 
 
 def albedo_of(scene: Scene) -> Albedo:
-    """A table where triangles have one colour each, the scene's textures where not."""
-    if scene.uv is not None and any(material.texture is not None for material in scene.materials):
+    """A table where triangles have one colour each, the scene's textures and colours of vertices where not."""
+    textured = scene.uv is not None and any(material.texture is not None for material in scene.materials)
+    if textured or scene.colour is not None:
         return lambda triangle, u, v: scene.albedo_at(triangle, np.stack([1 - u - v, u, v], 1)).astype(np.float32)
     table = np.array([entry.albedo for entry in scene.materials], np.float32)[scene.material]
     return lambda triangle, u, v: np.take(table, triangle, axis=0, mode="wrap")
@@ -136,16 +149,20 @@ def walked(
     bounces: int,
     gloss: Gloss | None = None,
     throughput: Float32[np.ndarray, "3 n"] | None = None,
+    air: Air | None = None,
 ) -> "list[Meetings]":
-    """Follows paths to their ends, and lists what they met: diffuse surfaces, and glossy ones or strands where there are any.
+    """Follows paths to their ends, and lists what they met: diffuse surfaces, and glossy ones, strands or fog if there are any.
 
     They begin with a throughput of 1, or with that given, which is overwritten.
     """
     origins, directions, owner = rays
     throughput = np.ones((3, len(owner)), np.float32) if throughput is None else throughput
-    parts, shiny, met = list[Vertices](), list[Any](), None
+    parts, shiny, ways, met, flights = list[Vertices](), list[Any](), list[Any](), None, None
     while True:
         triangle, u, v, distance = tracer.first(origins, directions)
+        if air:
+            triangle, flights = air.crossed(origins, directions, (triangle, distance), throughput, owner, rng)
+            ways += [flights.ways] if flights.ways else []
         if gloss:
             triangle, met = gloss.met(triangle, u, v, directions, throughput, owner, distance)
         place = np.empty((6, len(owner)), np.float32)
@@ -154,7 +171,7 @@ def walked(
         place, throughput, owner = place[:, :count], throughput[:, :count], owner[:count]
         parts.append(Vertices(place, throughput, owner))
         shiny += [met] if met else []
-        if (count == 0 and not met) or len(parts) == bounces:
+        if (count == 0 and not met and not flights) or len(parts) == bounces:
             break
         throughput, owner, triangle = throughput.copy(), owner.copy(), triangle[:count]
         numbers = rng.random((count, 3), np.float32)
@@ -162,13 +179,13 @@ def walked(
         count = _go_on(place, numbers, triangle, tracer.frames, throughput, owner, origins, directions)
         throughput, owner = np.ascontiguousarray(throughput[:, :count]), owner[:count].copy()
         origins, directions = origins[:count], directions[:count]
-        if met:
-            more = met.go_on(rng)
+        for other in filter(None, (met, flights)):
+            more = other.go_on(rng)
             origins, directions = np.concatenate([origins, more[0]]), np.concatenate([directions, more[1]])
             throughput, owner = np.concatenate([throughput, more[2]], 1), np.concatenate([owner, more[3]])
         if len(owner) == 0:
             break
-    return [Vertices.joined(parts), *([type(shiny[0]).joined(shiny)] if shiny else [])]
+    return [Vertices.joined(parts), *(type(kind[0]).joined(kind) for kind in (shiny, ways) if kind)]
 
 
 @compiled

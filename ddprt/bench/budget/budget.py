@@ -172,7 +172,7 @@ def table(document: dict[str, Any]) -> str:
 
 def engine_values(model: Model, lightings: list[Lighting], budget: BudgetConfig) -> tuple[np.ndarray, int]:
     """(lightings, points, 3) light at a model's points by shadow maps, W/m², and the rays that drew them."""
-    tracer, samples = Tracer(model.occluders, holes=model.holes), model.samples
+    tracer, samples = Tracer(model.occluders, holes=model.holes, fog=model.fog), model.samples
     settings: dict[str, Any] = {"resolution": budget.shadow_map, "taps": budget.shadow_filter, "depth": samples.depth}
     rows = [engine_irradiance(tracer, lighting, samples.position, samples.normal, **settings) for lighting in lightings]
     return average_into_points(np.stack(rows), samples, model.points, model.quantity), tracer.rays

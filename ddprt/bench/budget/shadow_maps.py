@@ -22,7 +22,6 @@ from ddprt import warp
 from ddprt.axes import Bool, Float32, Float64, Int
 from ddprt.errors import UserError
 from ddprt.lights import DirectionalLight, EnvironmentLight, Light, Lighting, MeshLight, PointLight, SphereLight, SpotLight
-from ddprt.transport.direct import centred
 from ddprt.transport.embree import Tracer, lifted
 
 _MESH_SPOTS = 16
@@ -147,9 +146,10 @@ def engine_irradiance(
       depth: how far behind the surface light is evaluated, metres; shadows are those of the surface.
     """
     places, total = positions - tracer.centre, np.zeros((len(positions), 3), np.float32)
-    for light in centred(tracer, lighting):
+    for light in (one.translated(-tracer.centre) for one in lighting):
         seen = ShadowMap.of(tracer, light, resolution).lit(places, normals, taps)
         lamp, spots = _without_size(light), _spots(light)
+        lamp = tracer.medium.veiled(lamp) if tracer.medium else lamp
 
         def shine(behind: float, lamp: Light = lamp, spots: np.ndarray = spots) -> Float32[np.ndarray, "n 3"]:
             at = lifted(tracer, (places - behind * normals).astype(np.float32), normals.astype(np.float32))

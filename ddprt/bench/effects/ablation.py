@@ -28,7 +28,8 @@ from ddprt.lights import Lighting
 from ddprt.progress import Progress, amount
 from ddprt.scene.mesh import Scene
 from ddprt.sections import PointsConfig
-from ddprt.transport.effects import EFFECTS, configured_scene, force, plan
+from ddprt.transport.configured import configured_scene
+from ddprt.transport.effects import EFFECTS, force, plan
 from ddprt.transport.embree import Tracer
 
 SCHEMA = 1

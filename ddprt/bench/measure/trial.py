@@ -31,7 +31,7 @@ from ddprt.runtime.model import Model
 from ddprt.runtime.precision import shipped_bytes, stored
 from ddprt.runtime.train import fit_config
 from ddprt.scene.mesh import Scene
-from ddprt.transport.effects import configured_scene
+from ddprt.transport.configured import configured_scene
 from ddprt.transport.embree import Tracer
 
 SCHEMA = 1

@@ -24,7 +24,7 @@ from ddprt.config import Config, checked
 from ddprt.dataset.generate import bake
 from ddprt.fitting.basis import fit_basis
 from ddprt.progress import Progress
-from ddprt.transport.effects import configured_scene
+from ddprt.transport.configured import configured_scene
 
 EPS = 2.0**-24
 """Largest relative error of rounding to float32."""

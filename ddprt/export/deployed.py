@@ -1,0 +1,85 @@
+"""Exports of every method: textures as of a linear model, what makes a frame, a shader, and numbers to check by."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ddprt import __version__
+from ddprt.export.frame import Frames
+from ddprt.export.glsl import shader
+from ddprt.export.golden import golden
+from ddprt.export.texel import texel_of
+from ddprt.export.textures import export_textures
+from ddprt.files import write_tensors, write_text
+from ddprt.methods.svd_ridge import LinearTransfer
+from ddprt.runtime.deployment import Deployment, deployment_of
+from ddprt.runtime.model import Model
+
+NETWORK, SHADER, GOLDEN = "network.safetensors", "decode.glsl", "golden.json"
+_U = "u = matrix (z - offset) + intercept"  # of the manifest's steps, the one that differs
+
+
+def export_model(model: Model, folder: str | Path, *, precision: str = "half", **options: Any) -> list[Path]:
+    """Writes the export of a model of any method.
+
+    Args:
+      model: as fitted or loaded.
+      folder: created if need be.
+      precision: "half" or "float" textures; weights are floats, being few.
+      options: as for `export_textures`.
+    Returns:
+      The files, the manifest last.
+    Raises:
+      UserError: the method does not say how it is deployed, has learned nothing, or the folder cannot be written.
+    """
+    folder, found = Path(folder), deployment_of(model)
+    linear = isinstance(model.relighter, LinearTransfer)
+    *written, path = export_textures(model if linear else found.textured(model), folder, precision=precision, **options)
+    for name in (NETWORK, SHADER, GOLDEN):
+        (folder / name).unlink(missing_ok=True)
+    manifest = json.loads(path.read_text())
+    scale, gamma = np.array(manifest["basis_scale"], np.float32), model.encoding.gamma
+    texel, more = texel_of(
+        found, scale, gamma=gamma if model.encoding.space == "gamma" else 1.0, constant=model.constant is not None
+    )
+    tensors = {**found.tensors, **more}
+    if tensors:
+        write_tensors(folder / NETWORK, {name: np.ascontiguousarray(part, np.float32) for name, part in tensors.items()})
+        written.append(folder / NETWORK)
+    why = texel.why_not
+    if not why:
+        write_text(folder / SHADER, shader(texel, __version__))
+        written.append(folder / SHADER)
+    if not linear:
+        manifest |= _told(manifest, found, model)
+    manifest["deployment"] = {
+        "shape": found.shape,
+        "features": list(found.features),
+        "network": NETWORK if tensors else None,
+        "frame": {name: list(where) for name, where in texel.rows.items()},
+        "shader": {"file": None, "why": why} if why else {"file": SHADER, "reads": texel.reads},
+        "golden": GOLDEN if texel.maps else None,
+    }
+    write_text(path, json.dumps(manifest, indent=1, ensure_ascii=False) + "\n")
+    if texel.maps:
+        document = golden(model, found, Frames.read(folder), folder)
+        write_text(folder / GOLDEN, json.dumps(document, allow_nan=False) + "\n")
+        written.append(folder / GOLDEN)
+    return [*written, path]
+
+
+def _told(manifest: dict[str, Any], found: Deployment, model: Model) -> dict[str, Any]:
+    """What the manifest says otherwise of a model that is not linear."""
+    steps = manifest["decode"]
+    at = steps.index(_U)
+    before = [] if found.lights else steps[:at]
+    sums = [_U.replace("z", "f"), *steps[at + 1 :]]
+    if found.shape == "table":
+        sums = ["y[c] = basis_scale[best[c]] * basis texture best[c], channel c", *steps[at + 2 :]]
+    return {
+        "channels": model.encoding.channels,
+        "matrix": {**manifest["matrix"], "axes": f"{'1' if len(found.matrix) == 1 else 'rgb'}, bases, features"},
+        "decode": [*before, *found.words, *sums],
+    }
