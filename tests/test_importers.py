@@ -274,9 +274,9 @@ OBJ = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n{}f 1/1 2/2 3/3\nf 1/1 3/3 4/4\n"
 def test_lightmap_coordinates_of_a_mesh_count_from_the_top(tmp_path: Path) -> None:
     (tmp_path / "a.obj").write_text(OBJ.format("vt 0 0\nvt .5 0\nvt .5 1\nvt 0 1\n"))
     scene = load_lightmapped(tmp_path / "a.obj")
-    assert scene.uv is not None
+    assert scene.lightmap is not None
     corner = np.flatnonzero((scene.positions == [0, 0, 0]).all(1))[0]
-    assert scene.uv[corner].tolist() == [0, 1]
+    assert scene.lightmap[corner].tolist() == [0, 1]
     (tmp_path / "b.obj").write_text(OBJ.format("vt 0 0\nvt 5 0\nvt 5 1\nvt 0 1\n"))
     with pytest.raises(UserError, match=r"got lightmap coordinates from 0 to 5"):
         load_lightmapped(tmp_path / "b.obj")

@@ -194,6 +194,7 @@ def _by_paths(job: Sampled, split: str, indices: list[int], seen: list[int], par
     halves, count = 1 + (split == "test"), len(indices)
     given = config.test_samples if split == "test" else config.samples
     address: dict[str, Any] = {"seed": job.config.seed, "bounces": job.bounces}
+    address |= {"smooth": split != "test" and config.footprint > 0}
     sizes = [min(count, size) for size in _SHADED]
     shaded = [[job.lightings[indices[place]] for place in np.linspace(0, count - 1, size).astype(int)] for size in sizes]
 

@@ -335,10 +335,10 @@ class IndirectBake:
     def _by_paths(self, split: str, indices: list[int], todo: list[int], kinds: list[str], stage: Stage) -> None:
         from ddprt.transport.paths import choose_samples, trace_paths
 
-        config, halves, stream = self.config.transport, len(kinds), f"{split} paths"
-        given = config.test_samples if split == "test" else config.samples
+        config, halves, stream, test = self.config.transport, len(kinds), f"{split} paths", split == "test"
+        given, smooth = config.test_samples if test else config.samples, not test and config.footprint > 0
         scene = self.tracer, self.scene, self.atlas, [self.dataset.lightings[index] for index in indices]
-        shared: dict[str, Any] = {"seed": self.config.seed, "bounces": self.effects.bounces}
+        shared: dict[str, Any] = {"seed": self.config.seed, "bounces": self.effects.bounces, "smooth": smooth}
         if given == "auto":
             given, noise = choose_samples(*scene, target=config.target_noise, stream=stream, **shared)
             stage.facts["noise_expected"] = float(f"{noise:.3g}")

@@ -127,7 +127,7 @@ class Dataset:
                 f"{path}: got {'none' if found is None else len(found)} exitant texels, expected one entry for each covered "
                 "texel, since dataset.json names exitant materials; bake it again"
             )
-        return None if found is None else found.astype(bool)
+        return found.astype(bool) if found is not None and found.any() else None
 
     def shaded(self, indices: Sequence[int]) -> Float32[np.ndarray, "lightings texels 3"]:
         """Direct light that surfaces scatter where it falls, W/m²: the maps, and 0 where all that leaves counts as indirect.
@@ -362,7 +362,8 @@ def write_plane(folder: Path, name: str, image: Float32[np.ndarray, "height widt
 def scene_tensors(scene: Scene, atlas: Atlas) -> dict[str, np.ndarray]:
     """What a dataset keeps of a scene: what casts shadows, and where it lies on the lightmap."""
     holes, exitant = Holes.of(scene), exitant_texels(scene, atlas)
-    leaving = {"exitant": exitant} if exitant.any() else {}
+    made_of = scene.strand_material
+    leaving = {"exitant": exitant} if exitant.any() or (made_of and made_of.fibre) else {}  # strands: what lamps make is added
     return {"corners": scene.corners, "uv": atlas.uv, **leaving, **(holes.tensors if holes else {})}
 
 

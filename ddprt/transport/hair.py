@@ -88,6 +88,7 @@ class Hair:
       material: how they scatter.
       gains: see `fibre.gains`.
       far: tables of the phase averaged over offsets.
+      near: reaches of a fibre, across it, within which lamps are weighed by the offset of the very ray; beyond, by tables.
     """
 
     tracer: Tracer
@@ -99,10 +100,11 @@ class Hair:
     material: Fibre
     gains: Float64[np.ndarray, "clarities angles"]
     far: FarFibre
+    near: float
 
     @classmethod
-    def of(cls, tracer: Tracer, scene: Scene) -> "Hair":
-        """Those of a scene that has some, of a material with a fibre."""
+    def of(cls, tracer: Tracer, scene: Scene, smooth: bool = False) -> "Hair":
+        """Those of a scene that has some, of a material with a fibre; the tables are for `smooth` ones alone."""
         tubes, made_of = scene.tubes, scene.strand_material
         assert tubes is not None
         assert made_of is not None
@@ -117,7 +119,7 @@ class Hair:
         reach = (CORNER * tubes.radius).ravel().astype(np.float32) + tracer.offset
         first = len(scene.triangles) - tubes.triangles
         rows = np.ascontiguousarray(rings.reshape(-1, 1 + SIDES, 3), np.float32)
-        tables = fibre.gains(material), FarFibre.of(material)
+        tables = fibre.gains(material), FarFibre.of(material), _FAR if smooth else np.inf
         return cls(tracer, first, tubes.pieces, rows, reach, absorption, material, *tables)
 
     def seen(
@@ -143,7 +145,7 @@ class Hair:
         rows = self.far.rows(look.sine, absorption, (look.offset + 1) / 2)
         there = Vertices(look.rows, throughput, owner)
         shape, across = fibre.shape_of(self.material), np.sqrt(np.maximum(1 - look.sine * look.sine, 0))
-        close = distance * across < _FAR * look.reach
+        close = distance * across < self.near * look.reach
         far = self.far.seen(there, look.frames, look.reach, held, rows, shape, close)
         return FibreVertices(there, look.frames, look.reach, held, shape, far)
 

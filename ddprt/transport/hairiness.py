@@ -30,9 +30,9 @@ def diffuse(material: Material) -> Material:
     return replace(material, fibre=None) if material.fibre else material
 
 
-def strands_of(tracer: Tracer, scene: Scene) -> Any:
+def strands_of(tracer: Tracer, scene: Scene, smooth: bool = False) -> Any:
     """The `ddprt.transport.hair.Hair` of a scene; None, and nothing imported, where there is none."""
-    return import_module("ddprt.transport.hair").Hair.of(tracer, scene) if hairy(scene) else None
+    return import_module("ddprt.transport.hair").Hair.of(tracer, scene, smooth) if hairy(scene) else None
 
 
 def borrowed_along(scene: Scene, share: float, paths: int) -> Callable[[np.ndarray], np.ndarray]:

@@ -53,6 +53,7 @@ def trace_paths(
     bounces: int = -1,
     skip: int = 0,
     texels: Int[np.ndarray, " chosen"] | None = None,
+    smooth: bool = False,
 ) -> Iterator[int]:
     """Mean indirect irradiance of texels for every lighting, tile by tile.
 
@@ -67,12 +68,15 @@ def trace_paths(
       bounces: -1 follows every path to its end by roulette; otherwise at most this many, at least 1.
       skip: tiles that `out` holds already.
       texels: the ones that are wanted; None for all.
+      smooth: lamps are weighed by what strands do on average over their width: a fraction of the noise, for a bias that
+        `ddprt.transport.far_fibre` tells of. Without hair it changes nothing.
     Yields:
       The number of texels of each finished tile, in order, the skipped ones included.
     """
     lamps = [[(light, shift(light)) for light in centred(tracer, lighting)] for lighting in lightings]
     settings: dict[str, Any] = {"samples": samples, "seed": seed, "stream": stream, "bounces": bounces}
-    yield from follow(tracer, scene, atlas, partial(shade, tracer, lamps), out, skip=skip, texels=texels, **settings)
+    chosen: dict[str, Any] = {"skip": skip, "texels": texels, "smooth": smooth}
+    yield from follow(tracer, scene, atlas, partial(shade, tracer, lamps), out, **chosen, **settings)
 
 
 def follow(
@@ -88,13 +92,14 @@ def follow(
     bounces: int = -1,
     skip: int = 0,
     texels: Int[np.ndarray, " chosen"] | None = None,
+    smooth: bool = False,
 ) -> Iterator[int]:
     """The same with light of any kind: `shading` tells what vertices are worth."""
     refuse_filled(scene, "unbiased paths")
     refuse_fog_beside(scene, any(glossy(scene)))
     air = import_module("ddprt.transport.fog").Air(tracer.medium) if tracer.medium else None
     receivers = Receivers.texels(atlas, samples, seed, f"{stream} paths", texels)
-    albedo, hair = albedo_of(scene), strands_of(tracer, scene)
+    albedo, hair = albedo_of(scene), strands_of(tracer, scene, smooth)
     gloss = hair or glossy_surfaces(tracer, scene)
 
     def work(item: tuple[int, slice]) -> int:
@@ -125,15 +130,16 @@ def choose_samples(
     seed: int,
     stream: str,
     bounces: int = -1,
+    smooth: bool = False,
 ) -> tuple[int, float]:
     """Paths per texel that a target for the noise takes, measured at a few texels, and the noise to expect.
 
     Args:
-      tracer, scene, atlas, lightings, bounces: see `trace_paths`.
+      tracer, scene, atlas, lightings, bounces, smooth: see `trace_paths`.
       target: RMSE of all maps over their mean; more than so many thousand paths are never chosen.
       seed, stream: address of the random numbers; independent of those of `trace_paths` with that stream.
     """
-    tracing = partial(trace_paths, tracer, scene, atlas, lightings)
+    tracing = partial(trace_paths, tracer, scene, atlas, lightings, smooth=smooth)
     return samples_for(tracing, atlas, len(lightings), target=target, seed=seed, stream=stream, bounces=bounces)
 
 
