@@ -78,16 +78,23 @@ def torchs(seen: Seen, steps: int, threads: int) -> Callable[[], None]:
         layers = torch.nn
         sizes = [POINTS + GROUPS, WIDTH, WIDTH, BASES]
         linear = [layers.Linear(a, b) for a, b in pairwise(sizes)]
-        gelu = layers.GELU(approximate="tanh")
-        network = layers.Sequential(linear[0], gelu, linear[1], gelu, linear[2])
-        optimiser = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=DECAY)
+        gate = layers.Softsign()
+
+        def network(values: Any) -> Any:
+            for layer in linear[:-1]:
+                values = layer(values)
+                values = 0.5 * values * (1 + gate(values))
+            return linear[-1](values)
+
+        parameters = [parameter for layer in linear for parameter in layer.parameters()]
+        optimiser = torch.optim.AdamW(parameters, lr=RATE, weight_decay=DECAY)
         paces = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
         share = size**2 / (size**2).sum()
         for _ in range(steps):
             optimiser.zero_grad(set_to_none=True)
             loss = (importance[..., None] * share * (network(inputs) - targets) ** 2).mean()
             loss.backward()
-            layers.utils.clip_grad_norm_(network.parameters(), 1.0)
+            layers.utils.clip_grad_norm_(parameters, 1.0)
             optimiser.step()
             paces.step()
 

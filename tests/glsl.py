@@ -66,7 +66,7 @@ def run(source: str, layers: np.ndarray, rows: np.ndarray, constant: np.ndarray 
         "mat4": Mat,
         "vec4": lambda *parts: Vec(np.array([float(part) for part in parts])) if len(parts) == 4 else _lit(parts),
         "vec3": lambda *parts: At(parts[1]) if parts[0] is None else wide(3, parts * (3 // len(parts))),
-        "gelu": lambda a: Vec(0.5 * a.values * (1 + np.tanh(0.7978845608 * (a.values + 0.044715 * a.values**3)))),
+        "gated": lambda a: Vec(0.5 * a.values * (1 + a.values / (1 + np.abs(a.values)))),
         "dot": lambda a, b: Vec((a.values * b.values).sum(-1, keepdims=True)),
         "max": lambda a, b: Vec(np.maximum(a.values, b)),
         "pow": lambda a, b: Vec(a.values**b.values),

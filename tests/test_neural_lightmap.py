@@ -99,7 +99,7 @@ def shader(found: NeuralLightmap, values: np.ndarray, last: bool) -> tuple[np.nd
         done += len(a)
         return float(sum(x * y for x, y in zip(a, b, strict=True)))
 
-    gelu = lambda x: 0.5 * x * (1 + np.tanh(np.sqrt(2 / np.pi) * (x + 0.044715 * x**3)))  # noqa: E731
+    gated = lambda x: 0.5 * x * (1 + x / (1 + abs(x)))  # noqa: E731
     hidden = len(layers[-1][1])
     light = np.zeros((texels, groups, out))
     counts, firsts, u = {}, {}, {}
@@ -123,7 +123,7 @@ def shader(found: NeuralLightmap, values: np.ndarray, last: bool) -> tuple[np.nd
             if units is None or not last:
                 units = f.reshape(-1)
                 for weight, bias in [firsts[g], *layers[1:]]:
-                    units = np.array([gelu(dot(units, weight[:, h]) + bias[h]) for h in range(weight.shape[1])])
+                    units = np.array([gated(dot(units, weight[:, h]) + bias[h]) for h in range(weight.shape[1])])
             for o in range(out):
                 light[t, g, o] = dot(f[o], parts["gain"] * u[g][: len(parts["gain"])]) + dot(units, counts[g][:, o])
     return light[..., 0] if groups == 3 else light[:, 0], done

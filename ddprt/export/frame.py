@@ -14,8 +14,6 @@ from safetensors.numpy import load_file
 
 from ddprt.axes import Float, Float32
 
-_ROOT = 0.7978845608  # sqrt(2 / pi)
-
 
 @dataclass(frozen=True, eq=False)
 class Frames:
@@ -101,10 +99,10 @@ class Frames:
         size = np.linalg.norm(c, axis=1, keepdims=True) if "reader" in n else np.ones((len(z), 1))
         h, k = c / np.where(size > 0, size, 1), 0
         while f"weight_{k}" in n:
-            h = _gelu(h @ n[f"weight_{k}"] + n[f"bias_{k}"])
+            h = _gated(h @ n[f"weight_{k}"] + n[f"bias_{k}"])
             k += 1
         return {"z": z, "units": size * h, "size": size}
 
 
-def _gelu(a: np.ndarray) -> np.ndarray:
-    return 0.5 * a * (1 + np.tanh(_ROOT * (a + 0.044715 * a**3)))
+def _gated(a: np.ndarray) -> np.ndarray:
+    return 0.5 * a * (1 + a / (1 + np.abs(a)))

@@ -23,9 +23,9 @@ uniform sampler2DArray layers;
 in vec2 lightmap;
 out vec4 light;
 """
-_GELU = """
-vec4 gelu(vec4 a) {  // past 10 tanh is 1 in floats, and its exponentials overflow where halves stand in for them
-  return 0.5 * a * (1.0 + tanh(clamp(0.7978845608 * (a + 0.044715 * a * a * a), -10.0, 10.0)));
+_GATED = """
+vec4 gated(vec4 a) {
+  return 0.5 * a * (1.0 + a / (1.0 + abs(a)));
 }
 """
 _LETTERS = "rgba"
@@ -55,8 +55,8 @@ def shader(texel: Texel, version: str) -> str:
         lines.append(f"y = pow(y, vec3({_number(texel.gamma)}));")
     glow = " + texture(constant, lightmap).rgb" if texel.constant else ""
     lines.append(f"light = vec4(row[{texel.rows['s'][0]}].rgb * y{glow}, 1.0);")
-    gelu = _GELU if texel.shape == "decode" else ""
-    return head + gelu + "\nvoid main() {\n" + "".join(f"  {line}\n" for line in lines) + "}\n"
+    gated = _GATED if texel.shape == "decode" else ""
+    return head + gated + "\nvoid main() {\n" + "".join(f"  {line}\n" for line in lines) + "}\n"
 
 
 def _compose(texel: Texel) -> list[str]:
@@ -89,7 +89,7 @@ def _decode(texel: Texel) -> list[str]:
                 f"mat4({', '.join(f'row[{start + LANES * t + c}]' for c in range(LANES))}) * t{t}" for t in range(texel.taps)
             ]
             units.append(f"{name}0_{block}")
-            lines.append(f"vec4 {units[-1]} = gelu(row[{start + each - 1}] + {' + '.join(sums)});")
+            lines.append(f"vec4 {units[-1]} = gated(row[{start + each - 1}] + {' + '.join(sums)});")
         units = _dense(lines, texel, name, units, range(1, len(texel.layers) + 1))
         for block, unit in enumerate(units):
             for colour in range(3) if groups == 1 else (group,):
@@ -103,7 +103,7 @@ def _dense(lines: list[str], texel: Texel, name: str, taps: list[str], numbers: 
         units = [f"{name}{number}_{block}" for block in range(len(weights))]
         for unit, blocks, bias in zip(units, weights, biases, strict=True):
             sums = [f"mat4({', '.join(map(_number, one.ravel()))}) * {tap}" for one, tap in zip(blocks, taps, strict=True)]
-            lines.append(f"vec4 {unit} = gelu({_vector(bias)} + {' + '.join(sums)});")
+            lines.append(f"vec4 {unit} = gated({_vector(bias)} + {' + '.join(sums)});")
         taps = units
     return taps
 

@@ -20,7 +20,7 @@ from ddprt.methods.method import Examples, FitReport, Frame, array_bytes, as_pyt
 @as_pytree
 @dataclass(frozen=True)
 class Perceptron:
-    """Dense layers with GELU between them, then the basis; channels are told apart by a one-hot input."""
+    """Dense layers, `gated` between them, then the basis; channels are told apart by a one-hot input."""
 
     weights: tuple[Float[Array, "_ _"], ...]
     biases: tuple[Float[Array, " _"], ...]

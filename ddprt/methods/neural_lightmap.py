@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 from pydantic import Field
 
 from ddprt.fitting.basis import entry_weights, fit_basis
-from ddprt.methods.learned import Layers, Learned, Seen, dense_layers, told
+from ddprt.methods.learned import Layers, Learned, Seen, dense_layers, gated, told
 from ddprt.methods.method import Examples, FitReport, Frame, array_bytes, as_pytree, columns, grouped, in_memory
 from ddprt.methods.svd_ridge import LinearTransfer, transfer_to
 
@@ -51,7 +51,7 @@ class Decoder(NamedTuple):
             turn = jnp.tensordot(light, self.turn, 1, precision="highest")
             layers = ((layers[0][0] + turn[:-1], layers[0][1] + turn[-1]), *layers[1:])
         for weight, bias in layers:
-            hidden = jax.nn.gelu(jnp.matmul(hidden, weight, precision="highest") + bias)
+            hidden = gated(jnp.matmul(hidden, weight, precision="highest") + bias)
         return hidden
 
     def decode(

@@ -30,7 +30,7 @@ class Units:
     """Hidden units of a texel.
 
     Attributes:
-      layers: from the values of all maps at a texel, colours one after the other, to the units; GELU after each.
+      layers: from the values of all maps at a texel, colours one after the other, to the units; `gated` after each.
       coefficients: from features to the numbers that tell of the light, (groups, numbers, features).
       turn: what each of them adds to the first layer, (numbers, from + 1, to), its biases last; of no numbers where light
         enters last.

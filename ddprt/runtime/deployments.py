@@ -23,8 +23,8 @@ from ddprt.methods.svd_ridge import LinearTransfer
 from ddprt.runtime.deployment import Deployment, Describing, Layers, Units
 from ddprt.runtime.model import Model
 
-_GELU = "gelu(a) = a (1 + tanh(0.7978845608 (a + 0.044715 a³))) / 2"
-_UNITS = "units: h = z; h = gelu(weight_k^T h + bias_k) for k = 0, 1, ...; bias_0 has a row per channel; " + _GELU
+_GATED = "gated(a) = a (1 + a / (1 + |a|)) / 2"
+_UNITS = "units: h = z; h = gated(weight_k^T h + bias_k) for k = 0, 1, ...; bias_0 has a row per channel; " + _GATED
 _READ = "c = reader z; size = |c|; units: h = c / size, 0 where size is 0; " + _UNITS.split("; ", 1)[1] + "; units = size h"
 _UNLIT = "lights are known, so nothing is measured: s = 1"
 _EXAMPLE = (4.0, 3.0, 2.0)
@@ -169,11 +169,12 @@ def _neural(found: NeuralLightmap, model: Model) -> Deployment:
     if not head.any():  # the baseline, which training could not better
         return plain
     last = (
-        "counts = counts f: what each unit counts; y = sum of u_b B_b + sum of counts_j h_j, h the units of the texel, " + _GELU
+        "counts = counts f: what each unit counts; y = sum of u_b B_b + sum of counts_j h_j, h the units of the texel, "
+        + _GATED
     )
     bent = (
         "v = coefficients f; first = first + sum of v_k turn_k: the first layer of the texel's units, one for each channel; "
-        "y = sum of u_b B_b + head . h, " + _GELU
+        "y = sum of u_b B_b + head . h, " + _GATED
     )
     words = (bent if units.turned else last, "maps are filtered before units are made of them")
     return replace(plain, shape="decode", words=words, units=units)
