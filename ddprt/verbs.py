@@ -242,6 +242,7 @@ VERBS = {
             "html": "FILE.html  write one file that opens from disk, and serve nothing",
             "dataset": "DIR  held-out lightings with their references and errors",
             "port": "N  of the address on this machine (default: a free one)",
+            "time": "SECONDS  when, for a model of an animation",
         },
         {"no-open": "open no browser"},
         configured=False,
