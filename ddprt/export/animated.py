@@ -43,6 +43,11 @@ def check_settings(settings: Mapping[str, Any]) -> None:
             f'export.formats: got "{further[0]}" with an animation, expected "exr" alone, whose scales the matrices of all '
             'keyframes carry; set export.formats = ["exr"]'
         )
+    if settings.get("engines"):
+        raise UserError(
+            f'export.engines: got "{settings["engines"][0]}" with an animation, expected none: their loaders know one transfer; '
+            "set export.engines = []"
+        )
 
 
 def export_animated(model: AnimatedModel, folder: str | Path, **settings: Any) -> list[Path]:
@@ -59,6 +64,7 @@ def export_animated(model: AnimatedModel, folder: str | Path, **settings: Any) -
     """
     check_settings(settings)
     folder = Path(folder)
+    settings = {name: value for name, value in settings.items() if name != "engines"}
     *files, path = export_textures(model.rest, folder, **settings)
     manifest = json.loads(path.read_text("utf-8"))
     scale = np.asarray(manifest["basis_scale"], np.float32)

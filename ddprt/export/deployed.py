@@ -9,9 +9,11 @@ import numpy as np
 
 from ddprt import __version__
 from ddprt.errors import UserError
+from ddprt.export.engines.packed import FORMAT
+from ddprt.export.engines.writing import check_engines, export_engines
 from ddprt.export.frame import Frames
 from ddprt.export.glsl import shader
-from ddprt.export.golden import golden
+from ddprt.export.golden import example_values, golden
 from ddprt.export.texel import texel_of
 from ddprt.export.textures import export_textures
 from ddprt.files import write_tensors, write_text
@@ -23,13 +25,23 @@ NETWORK, SHADER, GOLDEN = "network.safetensors", "decode.glsl", "golden.json"
 _U = "u = matrix (z - offset) + intercept"  # of the manifest's steps, the one that differs
 
 
-def export_model(model: Model, folder: str | Path, *, precision: str = "half", **options: Any) -> list[Path]:
+def export_model(
+    model: Model,
+    folder: str | Path,
+    *,
+    precision: str = "half",
+    formats: Sequence[str] = ("exr",),
+    engines: Sequence[str] = (),
+    **options: Any,
+) -> list[Path]:
     """Writes the export of a model of any method.
 
     Args:
       model: as fitted or loaded.
       folder: created if need be.
       precision: "half" or "float" textures; weights are floats, being few.
+      formats: as for `export_textures`.
+      engines: entries of `ENGINES` that get a folder each; for linear methods. They bring the format that they load.
       options: as for `export_textures`.
     Returns:
       The files, the manifest last.
@@ -38,9 +50,14 @@ def export_model(model: Model, folder: str | Path, *, precision: str = "half", *
         stored in formats whose transfer does no more than that, or the folder cannot be written.
     """
     folder, found = Path(folder), deployment_of(model)
-    _check_formats(model, found, options.get("formats", ("exr",)))
+    if engines:
+        check_engines(found, model.method)
+        formats = (*formats, *({FORMAT} - set(formats)))
+    _check_formats(model, found, formats)
     linear = isinstance(model.relighter, LinearTransfer)
-    *written, path = export_textures(model if linear else found.textured(model), folder, precision=precision, **options)
+    *written, path = export_textures(
+        model if linear else found.textured(model), folder, precision=precision, formats=formats, **options
+    )
     for name in (NETWORK, SHADER, GOLDEN):
         (folder / name).unlink(missing_ok=True)
     manifest = json.loads(path.read_text())
@@ -71,6 +88,7 @@ def export_model(model: Model, folder: str | Path, *, precision: str = "half", *
         document = golden(model, found, Frames.read(folder), folder)
         write_text(folder / GOLDEN, json.dumps(document, allow_nan=False) + "\n")
         written.append(folder / GOLDEN)
+    written += export_engines(folder, engines, model.covered, example_values(model))
     return [*written, path]
 
 
