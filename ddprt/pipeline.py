@@ -63,7 +63,7 @@ class Run:
 
         check_names(self.config)
         self._check_views()
-        if self.config.export.formats != ("exr",) and self.config.fit.method == "svd-ridge":
+        if self.config.export.formats != ("exr",):
             from ddprt.export.formats.listing import check_formats
 
             check_formats(self.config.export.formats, self.config.atlas.resolution, self.config.atlas.resolution)

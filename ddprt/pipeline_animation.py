@@ -152,3 +152,6 @@ class AnimatedRun:
         if self.config.fit.method != "svd-ridge":
             raise UserError(f'fit.method: got "{self.config.fit.method}" with an animation, expected "svd-ridge"; set it')
         refuse_still(self.animation.key(0), self.config)
+        from ddprt.export.animated import check_settings
+
+        check_settings(self.config.export.model_dump())

@@ -298,13 +298,16 @@ class ExportConfig(Section):
         ("exr",), min_length=1, description="files that basis textures are written to (docs/export.md)"
     )
     refit: bool = Field(True, description="fit the transfer to the textures as each format but exr holds them")
+    engines: tuple[Literal["unity", "unreal", "godot", "three", "c"], ...] = Field(
+        (), description="engines that get a folder with shader, loader and notes (docs/engines.md); brings the format raw"
+    )
 
-    @field_validator("formats")
+    @field_validator("formats", "engines")
     @classmethod
     def _each_once(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice:
-            raise ValueError(f'got "{twice}" more than once, expected every format once; leave the others out')
+            raise ValueError(f'got "{twice}" more than once, expected every one once; leave the others out')
         return names
 
 

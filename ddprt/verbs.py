@@ -145,9 +145,15 @@ def tune(call: Call) -> None:
 
 def export(call: Call) -> None:
     """write textures, matrices or a network, a shader and a manifest for engines"""
+    import json
+
+    from ddprt.export.engines.listing import ENGINES
     from ddprt.runtime.animated_file import is_animated, load_animated
     from ddprt.runtime.model_file import load_model
 
+    if call.asks("engines"):
+        names = [name.strip() for name in call.options["engines"].split(",")]
+        call.overrides["export.engines"] = json.dumps(list(ENGINES) if names == ["all"] else names)
     job = call.run()
     folder = job.folder / "model.ddprt"
     model = load_animated(folder) if is_animated(folder) else load_model(folder)
@@ -233,7 +239,9 @@ VERBS = {
         configured=False,
     ),
     "export": Verb(
-        export, options=_OUT, flags={"table": "   error against bytes of every format of textures (docs/export.md)"}
+        export,
+        options=_OUT | {"engines": "NAMES  folders of engines: unity, unreal, godot, three, c, or all (docs/engines.md)"},
+        flags={"table": "   error against bytes of every format of textures (docs/export.md)"},
     ),
     "view": Verb(
         view,
@@ -242,6 +250,7 @@ VERBS = {
             "html": "FILE.html  write one file that opens from disk, and serve nothing",
             "dataset": "DIR  held-out lightings with their references and errors",
             "port": "N  of the address on this machine (default: a free one)",
+            "time": "SECONDS  when, for a model of an animation",
         },
         {"no-open": "open no browser"},
         configured=False,

@@ -52,7 +52,7 @@ def relight(call: Call) -> None:
         )
     if out.suffix != ".exr":
         raise UserError(f"--out: got {out}, expected a path that ends in .exr; name it so")
-    model = _model_at(call.file("a model folder such as runs/cornell/model.ddprt"), call.options.get("time"))
+    model = _model_at(call, call.file("a model folder such as runs/cornell/model.ddprt"))
     if source.lstrip().startswith(("[", "{")):
         try:
             records = json.loads(source)
@@ -85,14 +85,15 @@ def relight(call: Call) -> None:
             print(f"warning: lighting {index}: extrapolating: {STATUSES['extrapolating']}", file=sys.stderr)
 
 
-def _model_at(folder: str, time: str | None) -> Any:
-    """The model of a folder; of what moves, at a time in seconds."""
+def _model_at(call: Call, folder: str | Path) -> Any:
+    """The model of a folder; of what moves, at the time of --time in seconds."""
     from ddprt.runtime.animated_file import is_animated, load_animated
     from ddprt.runtime.model_file import load_model
 
+    time = call.options.get("time")
     if is_animated(folder) != (time is not None):
         moves = "an animation and no --time, expected seconds" if time is None else "--time and a model that stands still"
-        raise UserError(f"ddprt relight: got {moves}; {'add it' if time is None else 'leave it out'}")
+        raise UserError(f"ddprt {call.verb}: got {moves}; {'add it' if time is None else 'leave it out'}")
     if time is None:
         return load_model(folder)
     try:
@@ -109,7 +110,6 @@ def view(call: Call) -> None:
     from ddprt.export.viewer.page import page
     from ddprt.export.viewer.serve import serve
     from ddprt.files import write_text
-    from ddprt.runtime.model_file import load_model
 
     out, port = call.options.get("html"), call.options.get("port", "0")
     if out is not None and Path(out).suffix not in (".html", ".htm"):
@@ -117,7 +117,7 @@ def view(call: Call) -> None:
     if not (port.isascii() and port.isdigit() and int(port) < 1 << 16):
         raise UserError(f"--port: got {port}, expected a whole number from 0 to 65535; 0 takes a free one")
     folder = Path(call.file("a model folder such as runs/cornell/model.ddprt"))
-    model = load_model(folder / "model.ddprt" if (folder / "model.ddprt").is_dir() else folder)
+    model = _model_at(call, folder / "model.ddprt" if (folder / "model.ddprt").is_dir() else folder)
     data = open_dataset(call.options["dataset"]) if call.asks("dataset") else None
     made = page(pack(model, data))
     if out is None:

@@ -5,11 +5,13 @@ matrices carry the same scales as that one.
 """
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ddprt.errors import UserError
 from ddprt.export.textures import export_textures
 from ddprt.files import write_tensors, write_text
 from ddprt.runtime.animated import AnimatedModel
@@ -26,6 +28,28 @@ DECODE = [
 ]
 
 
+def check_settings(settings: Mapping[str, Any]) -> None:
+    """Refuses what is written of one transfer alone, of which what moves has several.
+
+    Args:
+      settings: of [export].
+
+    Raises:
+      UserError: there is such a setting.
+    """
+    further = [name for name in settings.get("formats", ()) if name != "exr"]
+    if further:
+        raise UserError(
+            f'export.formats: got "{further[0]}" with an animation, expected "exr" alone, whose scales the matrices of all '
+            'keyframes carry; set export.formats = ["exr"]'
+        )
+    if settings.get("engines"):
+        raise UserError(
+            f'export.engines: got "{settings["engines"][0]}" with an animation, expected none: their loaders know one transfer; '
+            "set export.engines = []"
+        )
+
+
 def export_animated(model: AnimatedModel, folder: str | Path, **settings: Any) -> list[Path]:
     """Writes the export of a model of what moves.
 
@@ -36,9 +60,11 @@ def export_animated(model: AnimatedModel, folder: str | Path, **settings: Any) -
     Returns:
       The files, the manifest last.
     Raises:
-      UserError: the folder cannot be written.
+      UserError: formats other than "exr" are asked for, or the folder cannot be written.
     """
+    check_settings(settings)
     folder = Path(folder)
+    settings = {name: value for name, value in settings.items() if name != "engines"}
     *files, path = export_textures(model.rest, folder, **settings)
     manifest = json.loads(path.read_text("utf-8"))
     scale = np.asarray(manifest["basis_scale"], np.float32)

@@ -1,15 +1,19 @@
 """Exports of every method: textures as of a linear model, what makes a frame, a shader, and numbers to check by."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ddprt import __version__
+from ddprt.errors import UserError
+from ddprt.export.engines.packed import FORMAT
+from ddprt.export.engines.writing import check_engines, export_engines
 from ddprt.export.frame import Frames
 from ddprt.export.glsl import shader
-from ddprt.export.golden import golden
+from ddprt.export.golden import example_values, golden
 from ddprt.export.texel import texel_of
 from ddprt.export.textures import export_textures
 from ddprt.files import write_tensors, write_text
@@ -21,22 +25,39 @@ NETWORK, SHADER, GOLDEN = "network.safetensors", "decode.glsl", "golden.json"
 _U = "u = matrix (z - offset) + intercept"  # of the manifest's steps, the one that differs
 
 
-def export_model(model: Model, folder: str | Path, *, precision: str = "half", **options: Any) -> list[Path]:
+def export_model(
+    model: Model,
+    folder: str | Path,
+    *,
+    precision: str = "half",
+    formats: Sequence[str] = ("exr",),
+    engines: Sequence[str] = (),
+    **options: Any,
+) -> list[Path]:
     """Writes the export of a model of any method.
 
     Args:
       model: as fitted or loaded.
       folder: created if need be.
       precision: "half" or "float" textures; weights are floats, being few.
+      formats: as for `export_textures`.
+      engines: entries of `ENGINES` that get a folder each; for linear methods. They bring the format that they load.
       options: as for `export_textures`.
     Returns:
       The files, the manifest last.
     Raises:
-      UserError: the method does not say how it is deployed, has learned nothing, or the folder cannot be written.
+      UserError: the method does not say how it is deployed, has learned nothing, does more than add textures up and is to be
+        stored in formats whose transfer does no more than that, or the folder cannot be written.
     """
     folder, found = Path(folder), deployment_of(model)
+    if engines:
+        check_engines(found, model.method)
+        formats = (*formats, *({FORMAT} - set(formats)))
+    _check_formats(model, found, formats)
     linear = isinstance(model.relighter, LinearTransfer)
-    *written, path = export_textures(model if linear else found.textured(model), folder, precision=precision, **options)
+    *written, path = export_textures(
+        model if linear else found.textured(model), folder, precision=precision, formats=formats, **options
+    )
     for name in (NETWORK, SHADER, GOLDEN):
         (folder / name).unlink(missing_ok=True)
     manifest = json.loads(path.read_text())
@@ -48,7 +69,7 @@ def export_model(model: Model, folder: str | Path, *, precision: str = "half", *
     if tensors:
         write_tensors(folder / NETWORK, {name: np.ascontiguousarray(part, np.float32) for name, part in tensors.items()})
         written.append(folder / NETWORK)
-    why = texel.why_not
+    why = texel.why_not or ("" if manifest["layers"] else 'it reads EXR layers; add "exr" to export.formats')
     if not why:
         write_text(folder / SHADER, shader(texel, __version__))
         written.append(folder / SHADER)
@@ -60,14 +81,25 @@ def export_model(model: Model, folder: str | Path, *, precision: str = "half", *
         "network": NETWORK if tensors else None,
         "frame": {name: list(where) for name, where in texel.rows.items()},
         "shader": {"file": None, "why": why} if why else {"file": SHADER, "reads": texel.reads},
-        "golden": GOLDEN if texel.maps else None,
+        "golden": GOLDEN if manifest["layers"] else None,
     }
     write_text(path, json.dumps(manifest, indent=1, ensure_ascii=False) + "\n")
-    if texel.maps:
+    if manifest["layers"]:
         document = golden(model, found, Frames.read(folder), folder)
         write_text(folder / GOLDEN, json.dumps(document, allow_nan=False) + "\n")
         written.append(folder / GOLDEN)
+    written += export_engines(folder, engines, model.covered, example_values(model))
     return [*written, path]
+
+
+def _check_formats(model: Model, found: Deployment, formats: Sequence[str]) -> None:
+    """Formats other than EXR layers put their scales into a transfer, which networks of texels and tables do not go by."""
+    further = [name for name in formats if name != "exr"]
+    if further and found.shape != "compose":
+        raise UserError(
+            f'export.formats: got "{further[0]}" with {model.method}, whose texels do more than add textures up, '
+            'expected "exr" alone; set export.formats = ["exr"]'
+        )
 
 
 def _told(manifest: dict[str, Any], found: Deployment, model: Model) -> dict[str, Any]:
@@ -78,6 +110,10 @@ def _told(manifest: dict[str, Any], found: Deployment, model: Model) -> dict[str
     sums = [_U.replace("z", "f"), *steps[at + 1 :]]
     if found.shape == "table":
         sums = ["y[c] = basis_scale[best[c]] * basis texture best[c], channel c", *steps[at + 2 :]]
+    if "decode_formats" in manifest:
+        manifest["decode_formats"] = [
+            step.replace("z as", "f as").replace("(z -", "(f -") for step in manifest["decode_formats"]
+        ]
     return {
         "channels": model.encoding.channels,
         "matrix": {**manifest["matrix"], "axes": f"{'1' if len(found.matrix) == 1 else 'rgb'}, bases, features"},
