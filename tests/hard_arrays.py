@@ -56,7 +56,7 @@ def make_data(measured: np.ndarray, indirect: np.ndarray, area: np.ndarray | Non
     texels = indirect.shape[1]
     area = np.linspace(1, 2, texels) if area is None else area
     places = np.linspace(0, 1, 3 * points).reshape(points, 3)
-    data.__dict__["gbuffer"] = {"area": area.astype(np.float32)[:, None]}
+    data.__dict__["gbuffer"] = {"area": area.astype(np.float32)[:, None], "albedo": np.full((texels, 3), 0.5, np.float32)}
     data.__dict__["covered"] = np.ones((1, texels), bool)
     data.__dict__["samples"] = Samples(places, np.tile([0.0, 1.0, 0.0], (points, 1)), np.ones((points, 3)), 0.1)
     data.__dict__["occluders"] = np.zeros((1, 3, 3))

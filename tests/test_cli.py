@@ -137,7 +137,7 @@ def test_inspect_and_doctor(capsys: pytest.CaptureFixture) -> None:
 
 FAULTS = {
     "unknown verb": (["rnu"], 'no verb "rnu"; did you mean "run"?'),
-    "later verb": (["import", "x"], "not built yet"),
+    "later verb": (["status", "x"], "not built yet"),
     "no file": (["run"], "got 0 files, expected a configuration"),
     "a scene for a configuration": (
         ["bake", "cornell"],

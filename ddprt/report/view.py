@@ -68,7 +68,13 @@ class Camera:
 _CORNELL = Camera((0.278, 0.273, -0.8), (0.278, 0.273, 0.0), 39.3, 1.0)  # as photographed in Cornell
 _STATUE = Camera((1.5, 1.9, 3.4), (0.0, 0.75, 0.0))
 _LION = Camera((1.72, 1.08, 1.43), (0.0, 0.42, 0.0))  # from its flank, which is what fills a picture
-_CAMERAS = {**dict.fromkeys(("cornell", "cornell-hole", "glossy-room"), _CORNELL), "statue": _STATUE, "lion": _LION}
+_BENDING = Camera((1.3, 1.45, 2.0), (0.1, 0.35, 0.0))  # without the corners of its floor
+_CAMERAS = {
+    **dict.fromkeys(("cornell", "cornell-hole", "glossy-room", "foggy-room"), _CORNELL),
+    "statue": _STATUE,
+    "lion": _LION,
+    "bending": _BENDING,
+}
 
 
 def default_camera(scene: Scene) -> Camera:
