@@ -45,7 +45,7 @@ def check_settings(settings: Mapping[str, Any]) -> None:
         )
     if settings.get("engines"):
         raise UserError(
-            f'export.engines: got "{settings["engines"][0]}" with an animation, expected none: their loaders know one transfer; '
+            f'export.engines: got "{settings["engines"][0]}" with an animation, expected none: loaders know one transfer; '
             "set export.engines = []"
         )
 

@@ -1,7 +1,7 @@
 """model.bin: all that a linear model is at run time, in one little-endian file that a dozen lines read in any language.
 
-The layout is told in docs/engines.md and read by `c/ddprt_runtime.h` and the loaders beside it; this is its twin in NumPy, which
-the golden numbers are made with.
+The layout is told in docs/engines.md and read by `c/ddprt_runtime.h` and the loaders beside it; this is its twin in NumPy, with
+which the golden numbers are made.
 """
 
 import json

@@ -87,7 +87,7 @@ def _golden(packed: Packed, covered: np.ndarray, values: np.ndarray) -> dict[str
 
 
 def _as_text(document: dict[str, Any]) -> str:
-    """The same for languages that read no JSON: counts of points and texels, values, then row, column and light of each texel."""
+    """The same for languages that read no JSON: counts of points and texels, values, then row, column and light each."""
     lines = [f"{len(document['values'])} {len(document['texels'])}"]
     lines += [" ".join(map(repr, value)) for value in document["values"]]
     lines += [" ".join(map(repr, [*texel, *light])) for texel, light in zip(document["texels"], document["light"], strict=True)]
