@@ -3,14 +3,9 @@
 import base64
 import importlib.util
 import json
-import os
-import re
 import shutil
 import subprocess
-import threading
 from collections.abc import Callable
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
@@ -18,14 +13,12 @@ import pytest
 from made_up_rivals import SHAPE
 from test_engines import CASES, close
 from test_engines import made as made
+from three_page import needs_three, told_by_three
 
-from ddprt.export.browser import browser
 from ddprt.export.engines.packed import Packed
 from ddprt.runtime.model import Model
 
 NODE, MONO, MCS = map(shutil.which, ("node", "mono", "mcs"))
-THREE = os.environ.get("DDPRT_THREE", "")  # a folder of three.js as npm has it
-FLAGS = ("--headless", "--no-sandbox", "--enable-unsafe-swiftshader", "--use-angle=swiftshader", "--dump-dom")
 Made = Callable[[str], tuple[Model, Path]]
 DAMAGED = ["not a model of this version of ddprt", "damaged", "damaged"]
 
@@ -115,48 +108,22 @@ def test_mono_makes_the_golden_rows(case: str, made: Made, tmp_path: Path) -> No
     check_told(told, model, json.loads((folder / "unity/golden.json").read_text()))
 
 
-THREE_PAGE = """<!doctype html><meta charset="utf-8"><pre id="told"></pre>
-<script type="importmap">{"imports": {"three": "/three/build/three.module.js"}}</script>
-<script type="module">
-let told;
-try {
-  const THREE = await import("three"), { Lightmap } = await import("/model/lightmap.js");
-  const renderer = new THREE.WebGLRenderer();
+COMPOSED = """
+  const { Lightmap } = await import("/model/lightmap.js"), renderer = new THREE.WebGLRenderer();
   const lightmap = await Lightmap.load(THREE, renderer, new URL("/model/", location.href));
   lightmap.relight(Float32Array.from({ length: 3 * lightmap.model.samples }, (_, i) => i % 7));
   const { width, height } = lightmap.model, light = new Float32Array(4 * width * height);
   renderer.readRenderTargetPixels(lightmap.target, 0, 0, width, height, light);
-  told = { light: btoa(String.fromCharCode(...new Uint8Array(light.buffer))), channel: lightmap.texture.channel };
-} catch (error) { told = { fault: String(error.stack || error) }; }
-document.getElementById("told").textContent = JSON.stringify(told);
-</script>"""
-
-
-class Quiet(SimpleHTTPRequestHandler):
-    """Serves a folder without a word."""
-
-    def log_message(self, format: str, *args: object) -> None:
-        pass
+  told = { light: text(light), channel: lightmap.texture.channel };
+"""
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(browser() is None or not THREE, reason="needs a browser, and DDPRT_THREE, the folder of npm's three")
+@needs_three
 @pytest.mark.parametrize("case", CASES)
 def test_three_composes_the_lightmap(case: str, made: Made, tmp_path: Path) -> None:
     model, folder = made(case)
-    (tmp_path / "three").symlink_to(Path(THREE).resolve())
-    (tmp_path / "model").symlink_to(folder / "three")
-    (tmp_path / "index.html").write_text(THREE_PAGE)
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(tmp_path))) as running:
-        threading.Thread(target=running.serve_forever, daemon=True).start()
-        address = f"http://127.0.0.1:{running.server_address[1]}/index.html"
-        command = [str(browser()), *FLAGS, "--virtual-time-budget=10000", f"--user-data-dir={tmp_path / 'profile'}", address]
-        done = subprocess.run(command, capture_output=True, text=True)
-        running.shutdown()
-    answer = re.search(r'<pre id="told">(.*?)</pre>', done.stdout, re.DOTALL)
-    assert answer, done.stdout
-    told = json.loads(answer[1])
-    assert "fault" not in told, told
+    told = told_by_three(COMPOSED, folder / "three", tmp_path)
     light = np.frombuffer(base64.b64decode(told["light"]), np.float32).reshape(*SHAPE, 4)[..., :3]
     packed = Packed.read(folder)
     expected = packed.light(packed.rows(*packed.frame(averaged(model))), np.argwhere(np.ones(SHAPE))).reshape(*SHAPE, 3)
