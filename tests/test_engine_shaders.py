@@ -86,7 +86,7 @@ def test_no_shader_is_forgotten() -> None:
 def compiled(folder: Path, language: str, stage: str, source: str, *flags: str) -> None:
     path = folder / f"{language}.{stage}"
     path.write_text(source)
-    done = subprocess.run([str(VALIDATOR), *flags, "-S", stage, str(path)], capture_output=True, text=True)
+    done = subprocess.run([str(VALIDATOR), *flags, "-S", stage, str(path)], cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout
 
 

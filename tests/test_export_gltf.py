@@ -181,7 +181,13 @@ def test_what_is_not_written_is_named(tmp_path: Path) -> None:
     wax = Material("wax", (0.5,) * 3, subsurface=Subsurface((0.9,) * 3, (0.1,) * 3), gloss=Gloss(dielectric=0.02))
     box = trimesh.creation.box()
     scene = checked("box", box.vertices, box.faces, materials=(wax,))
-    told = document(export_gltf(of_scene(scene, corners_apart(scene)), tmp_path, scene))
+    uv = corners_apart(scene)
+    told = document(path := export_gltf(of_scene(scene, uv), tmp_path, scene))
+    again = load_scene(str(path))
+    assert again.lightmap is not None
+    np.testing.assert_array_equal(
+        rows_of(again.corners, again.lightmap[again.triangles]), rows_of(scene.corners, uv), "vertices are cut where charts are"
+    )
     assert told["nodes"][0]["extras"]["ddprt"]["left_out"] == ["subsurface"]
     index = told["materials"][0]["extensions"]["KHR_materials_ior"]["ior"]
     assert ((index - 1) / (index + 1)) ** 2 == pytest.approx(0.02)
