@@ -1,6 +1,7 @@
 """A bake of poses, one basis of them all, matrices for each or for all: laws, closed forms, and the way through the verbs."""
 
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -13,20 +14,25 @@ from small_job import call
 import ddprt
 from ddprt.config import Config, checked, load_config
 from ddprt.dataset.animated import AnimatedData, bake_animation, open_animation, refuse_still
+from ddprt.dataset.store import open_dataset
 from ddprt.errors import UserError
 from ddprt.export.animated import FILE, export_animated
-from ddprt.files import read_tensors
+from ddprt.export.viewer.pack import pack
+from ddprt.files import read_tensors, write_tensors
 from ddprt.lights import parse_lighting
 from ddprt.report.animated import at_pose, maps, noise, poses, score, table
 from ddprt.runtime.animated import AnimatedModel
 from ddprt.runtime.animated_file import load_animated
 from ddprt.runtime.train import fit_config
 from ddprt.runtime.train_animated import fit_animation
+from ddprt.sampling.points import Samples
 from ddprt.scene.library import build
 from ddprt.scene.material import Material
 from ddprt.scene.poses import Animation, load_animation, posed
 from ddprt.scene.shapes import box, faceted, rectangle
 from ddprt.transport.effects import plan
+from ddprt.transport.embree import Tracer
+from ddprt.transport.measure import measure
 
 ARM = {"rings": 6, "around": 6}
 RIDGE = 1e-3
@@ -123,6 +129,52 @@ def test_every_pose_has_its_own_light_and_the_same_texels(data: AnimatedData, ar
         open_animation(arm, job(), data.folder / "nowhere")
 
 
+LAMP = [{"type": "point", "position": [0.4, 1.1, 0.3], "intensity": [1, 2, 0.5]}]
+
+
+def home_of_the_first_pose(data: AnimatedData) -> np.ndarray:
+    """The point of each sample, 12 points, by a loop over the first pose."""
+    first = data.keys[0].samples
+    spread = first.spacing * np.sqrt(2)
+    place, turned = (np.linalg.norm(part[:, None] - part[None, :12], axis=2) for part in (first.position, first.normal))
+    found = np.hypot(place / spread, turned / np.sqrt(2)).argmin(1)
+    return np.where(np.arange(len(found)) < 12, np.arange(len(found)), found)
+
+
+def grouped(light: np.ndarray, samples: Samples, home: np.ndarray) -> np.ndarray:
+    return np.stack([(light * samples.albedo)[home == point].mean(0) for point in range(12)])
+
+
+def test_samples_stay_with_their_points(data: AnimatedData, models: dict[str, AnimatedModel], tmp_path: Path) -> None:
+    """In the datasets of all poses, in a model of any moment, and in what is saved of that."""
+    home = home_of_the_first_pose(data)
+    moved = data.keys[1].samples
+    assert (replace(moved, rest=None).nearest_point(12) != home).any(), "by nearness in its own pose one would change"
+    for part in (*data.keys, data.between[0][1], *data.wide):
+        again = part if part in data.wide else open_dataset(part.folder)
+        light = again.measured([0])[0]
+        np.testing.assert_allclose(again.values([0], 12, "radiosity")[0], grouped(light, again.samples, home), rtol=2e-6)
+    lamp = parse_lighting(LAMP)
+    for time in (0.0, 0.4, 0.5):
+        model = models["each"].at(time)
+        model.save(tmp_path / "moment")
+        models["each"].save(tmp_path / "all")
+        for found in (model, load_animated(tmp_path / "all").at(time), ddprt.load_model(tmp_path / "moment")):
+            samples = found.samples
+            light = measure(Tracer(found.occluders), lamp, samples.position, samples.normal, seed=0, depth=samples.depth)
+            np.testing.assert_allclose(found.measure(LAMP), grouped(light, samples, home), rtol=2e-6, atol=1e-9)
+
+
+def test_older_bakes_whose_samples_change_their_points_are_refused(data: AnimatedData, arm: Animation, tmp_path: Path) -> None:
+    shutil.copytree(data.folder, tmp_path / "old")
+    path = tmp_path / "old" / "key-01" / "points.safetensors"
+    tensors = {name: array for name, array in read_tensors(path).items() if not name.startswith("rest.")}
+    assert len(tensors) == 5
+    write_tensors(path, tensors)
+    with pytest.raises(UserError, match=r"key-01: got samples of an older version.*bake again into another --out"):
+        open_animation(arm, job(), tmp_path / "old")
+
+
 def slow_fit(data: AnimatedData, keys: list[int], U: np.ndarray, area: np.ndarray) -> np.ndarray:
     """M of the red channel: ridge regression of projections on measurements, in float64 with loops over keyframes."""
     D, C = [], []
@@ -148,6 +200,13 @@ def test_transfers_are_ridge_regressions_onto_one_basis(data: AnimatedData, mode
     for k in (0, 1):
         np.testing.assert_allclose(each.matrix[k, 0], slow_fit(data, [k], U, area), atol=2e-4 * np.abs(each.matrix).max())
     np.testing.assert_allclose(one.matrix[0, 0], slow_fit(data, [0, 1], U, area), atol=2e-4 * np.abs(one.matrix).max())
+
+
+def test_albedo_is_kept_to_be_shown(data: AnimatedData, models: dict[str, AnimatedModel]) -> None:
+    model = models["one"].at(0.2)
+    for part in data.keys:
+        np.testing.assert_array_equal(model.image(model.albedo)[part.covered], part.gbuffer["albedo"])
+    assert not any("albedo" in note for note in pack(model)["notes"])
 
 
 def test_the_basis_is_the_best_of_all_keys_together(data: AnimatedData, models: dict[str, AnimatedModel]) -> None:
@@ -192,14 +251,21 @@ def test_saved_is_loaded(models: dict[str, AnimatedModel], tmp_path: Path) -> No
         np.testing.assert_array_equal(again.relight(light, time=0.3), model.relight(light, time=0.3))
         assert again.nbytes == model.nbytes
         assert again.statuses == model.statuses
-    at_rest = ddprt.load_model(tmp_path / "each")
-    np.testing.assert_array_equal(at_rest.relight(light), models["each"].relight(light, time=0.0))
-    models["one"].rest.save(tmp_path / "each")
+    with pytest.raises(UserError, match=r"each: got a model of an animation, expected .* ddprt\.load_animated"):
+        ddprt.load_model(tmp_path / "each")
+    models["one"].rest.save(tmp_path / "rest")
+    for name in ("model.json", "tensors.safetensors"):
+        shutil.copy(tmp_path / "rest" / name, tmp_path / "each" / name)
     with pytest.raises(UserError, match=r"tensors\.safetensors is not what was saved with it"):
         load_animated(tmp_path / "each")
+    models["one"].rest.save(tmp_path / "each")  # in its place, a model that stands still
+    at_rest = ddprt.load_model(tmp_path / "each")
+    np.testing.assert_array_equal(at_rest.relight(light), models["one"].relight(light, time=0.0))
+    with pytest.raises(UserError, match=r"got no animation\.json"):
+        load_animated(tmp_path / "each")
     for damage, says in (
-        (lambda text: text.replace('"schema": 1', '"schema": 9'), "schema 9"),
-        (lambda text: text.replace("spacing", "spicing"), "spacing"),
+        (lambda text: text.replace('"schema": 2', '"schema": 1'), "schema 1, expected 2; fit it again"),
+        (lambda text: text.replace("statuses", "statutes"), "statuses"),
         (lambda text: text[: len(text) // 2], "animation.json: got"),
     ):
         models["one"].save(tmp_path / "one")
@@ -226,6 +292,8 @@ def test_texels_that_a_pose_buries_are_dark_there_and_kept(tmp_path: Path) -> No
     hidden = up & ~down
     assert hidden.sum() > 20
     np.testing.assert_array_equal(data.covered, up | down)
+    assert (data.keys[1].gbuffer["albedo"] == np.float32(0.6)).all()
+    np.testing.assert_array_equal(data.albedo, np.full((len(data.albedo), 3), 0.6, np.float32))
     lost = hidden[data.covered]
     light = data.wide[1].maps("indirect", [0, 1])
     assert not light[:, lost].any()

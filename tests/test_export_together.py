@@ -26,7 +26,7 @@ def moving() -> AnimatedModel:
     """A made-up model of two keyframes, half a second apart, by the second of which it is twice as large."""
     rest = replace(model_of(relighters(5, 3)["plain"]), method="svd-ridge")
     corners = rest.occluders.reshape(-1, 3).astype(np.float64)
-    riders = Riders(np.arange(POINTS) % 2, np.full((POINTS, 3), 1 / 3), np.full((POINTS, 3), 0.5), spacing=0.3)
+    riders = Riders(np.arange(POINTS) % 2, np.full((POINTS, 3), 1 / 3), rest.samples)
     parts = [np.stack([np.asarray(getattr(rest.relighter, name))] * 2) for name in ("matrix", "offset", "intercept")]
     return AnimatedModel(
         rest,

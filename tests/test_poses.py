@@ -1,6 +1,7 @@
 """What moves: clips of glTF files beside a slow twin in loops, files as poses, motions in code, and points that ride along."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from test_scene_files import TRIANGLE, Writer
 
 from ddprt.errors import UserError
-from ddprt.sampling.points import place_samples
+from ddprt.sampling.points import Samples, place_samples
 from ddprt.sampling.riding import place_riders
 from ddprt.scene.atlas import Atlas, build_atlas
 from ddprt.scene.gltf_motion import Channel, load_clip
@@ -322,6 +323,19 @@ def test_points_ride_on_the_mesh(arm: Animation) -> None:
         np.testing.assert_allclose(moved.position[k], place, atol=1e-12)
         np.testing.assert_allclose(moved.normal[k], across / np.linalg.norm(across), atol=1e-12)
     assert moved.spacing == still.spacing
+
+
+def test_a_sample_stays_with_its_point(arm: Animation) -> None:
+    riders = place_riders(arm.scene, 96, seed=3, atlas=build_atlas(arm.scene, 32))
+    at_rest, moved = (riders.at(arm.key(index).corners, depth=0.5) for index in (0, 2))
+    home = at_rest.nearest_point(12)
+    assert at_rest.rest is None
+    assert (replace(moved, rest=None).nearest_point(12) != home).any(), "by nearness alone some would change"
+    np.testing.assert_array_equal(moved.nearest_point(12), home)
+    kept = Samples.read(moved.tensors, moved.spacing, moved.depth)
+    np.testing.assert_array_equal(kept.nearest_point(12), home)
+    assert kept.digest == moved.digest != replace(moved, rest=None).digest
+    assert (kept.depth, kept.spacing) == (0.5, at_rest.spacing)
 
 
 def test_shading_normals_turn_with_their_faces(statue: Scene) -> None:
