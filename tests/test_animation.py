@@ -1,11 +1,13 @@
 """A bake of poses, one basis of them all, matrices for each or for all: laws, closed forms, and the way through the verbs."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +18,8 @@ from ddprt.config import Config, checked, load_config
 from ddprt.dataset.animated import AnimatedData, bake_animation, open_animation, refuse_still
 from ddprt.dataset.store import open_dataset
 from ddprt.errors import UserError
-from ddprt.export.animated import FILE, export_animated
+from ddprt.export.animated import export_animated
+from ddprt.export.deployed import export_model
 from ddprt.export.viewer.pack import pack
 from ddprt.files import read_tensors, write_tensors
 from ddprt.lights import parse_lighting
@@ -26,6 +29,7 @@ from ddprt.runtime.animated_file import load_animated
 from ddprt.runtime.train import fit_config
 from ddprt.runtime.train_animated import fit_animation
 from ddprt.sampling.points import Samples
+from ddprt.scene.exr import write_exr
 from ddprt.scene.library import build
 from ddprt.scene.material import Material
 from ddprt.scene.poses import Animation, load_animation, posed
@@ -34,6 +38,7 @@ from ddprt.transport.effects import plan
 from ddprt.transport.embree import Tracer
 from ddprt.transport.measure import measure
 
+DOCS = Path(__file__).parent.parent / "docs"
 ARM = {"rings": 6, "around": 6}
 RIDGE = 1e-3
 JOB = {
@@ -327,25 +332,68 @@ def test_scores_are_those_of_the_poses(data: AnimatedData, models: dict[str, Ani
     assert light.shape == truth.reference.shape
 
 
-def test_export_holds_every_key(models: dict[str, AnimatedModel], tmp_path: Path) -> None:
-    """Decoded from the files alone, by the steps of the manifest."""
-    model = models["each"]
-    export_animated(model, tmp_path, precision="float", stitch=False)
-    manifest, found = json.loads((tmp_path / "manifest.json").read_text()), read_tensors(tmp_path / FILE)
-    assert manifest["animation"]["keys"] == manifest["animation"]["matrices"] == 2
-    still = read_tensors(tmp_path / "transfer.safetensors")
-    np.testing.assert_array_equal(found["matrix"][0], still["matrix"])
-    values = np.random.default_rng(0).random((12, 3))
-    basis = np.asarray(model.rest.relighter.basis) / np.array(manifest["basis_scale"])[:, None]
-    for time in (0.0, 0.2, 0.5):
-        k = min(int(np.searchsorted(found["times"], time, side="right")) - 1, 0)
-        t = (time - found["times"][k]) / (found["times"][k + 1] - found["times"][k])
-        M = (1 - t) * found["matrix"][k] + t * found["matrix"][k + 1]
-        size = np.linalg.norm(values, axis=0)
-        light = np.stack([size[c] * np.maximum(basis.T @ (M[c] @ (values[:, c] / size[c])), 0) for c in range(3)], 1)
-        np.testing.assert_allclose(light, model.at(time).predict(values), atol=1e-4 * light.max())
-    for k, time in enumerate(found["times"]):
-        np.testing.assert_allclose(found["position"][k], model.at(float(time)).samples.position, atol=1e-6)
+def documented(name: str) -> dict[str, Any]:
+    """The Python blocks of a page of docs/, executed; of effects.md the one about what moves."""
+    scope: dict[str, Any] = {}
+    for block in re.findall(r"```python\n(.*?)```", (DOCS / name).read_text(), re.DOTALL):
+        if name != "effects.md" or "def moment" in block:
+            exec(block, scope)
+    return scope
+
+
+@pytest.mark.parametrize("way", ["each", "one", "glowing"])
+def test_an_export_is_decoded_by_the_documented_steps(
+    way: str, models: dict[str, AnimatedModel], arm: Animation, tmp_path: Path
+) -> None:
+    """Measured, mixed and lit from the files alone, at keys and between, where the mesh goes straight."""
+    model = models["one" if way == "one" else "each"]
+    if way == "glowing":
+        glow = np.random.default_rng(1).random((2, len(model.rest.area), 3)).astype(np.float32)
+        model = replace(model, constant=glow, rest=replace(model.rest, constant=glow[0]))
+    folder, then = tmp_path / "export", tmp_path / "then"
+    files = export_animated(model, folder, precision="float", stitch=False)
+    assert {path.name for path in files} == {path.name for path in folder.iterdir()}
+    shutil.copytree(folder, then)
+    moment, page = documented("effects.md")["moment"], documented("deployment.md")
+    manifest = json.loads((folder / "manifest.json").read_text())
+    golden = {entry["time"]: entry for entry in json.loads((folder / "animation-golden.json").read_text())["moments"]}
+    assert list(golden) == pytest.approx([0.0, 0.15, 0.5])
+    lamp = parse_lighting(LAMP)
+    for time in (0.0, 0.2, 0.5, *golden):
+        still = model.at(time)
+        transfer, points = moment(folder, time)
+        light = measure(Tracer(still.occluders), lamp, points["position"], points["normal"], seed=0, depth=manifest["depth"])
+        home, size = np.array(points["home"]), np.abs(still.measure(LAMP)).max()
+        x = np.stack([(light * points["albedo"])[home == point].mean(0) for point in range(12)])
+        np.testing.assert_allclose(x, still.measure(LAMP), atol=1e-4 * size)
+        write_tensors(then / "transfer.safetensors", transfer)
+        if way == "glowing":
+            write_exr(then / "constant.exr", points["constant"], half=False)
+        image = page["light"](then, page["frame"](then, x))
+        expected = still.predict(x.astype(np.float32))
+        np.testing.assert_allclose(image[still.covered], expected, atol=1e-4 * expected.max())
+        if time in golden:
+            entry = golden[time]
+            np.testing.assert_allclose(entry["measured"], still.measure(entry["lighting"]), rtol=1e-6)
+            assert np.max(entry["measured"]) > 0
+            rows = page["frame"](then, np.array(entry["values"]))
+            np.testing.assert_allclose(entry["rows"], rows, atol=1e-5 * np.abs(rows).max())
+            lit = page["light"](then, rows)[tuple(np.transpose(entry["texels"]))]
+            np.testing.assert_allclose(entry["light"], lit, atol=1e-4 * lit.max())
+    assert (np.array(golden[0.0]["rows"]) != np.array(golden[0.5]["rows"])).any()
+
+
+def test_an_export_of_what_moves_is_one_of_its_first_pose_and_more(models: dict[str, AnimatedModel], tmp_path: Path) -> None:
+    export_animated(models["each"], tmp_path / "moving")
+    (tmp_path / "moving" / "constant-07.exr").touch()  # of an earlier one, with more keys and a glow
+    export_animated(models["each"], tmp_path / "moving")
+    export_model(models["each"].rest, tmp_path / "still")
+    found, still = ({path.name: path.read_bytes() for path in (tmp_path / name).iterdir()} for name in ("moving", "still"))
+    assert found.keys() - still.keys() == {"animation.safetensors", "animation-golden.json"}
+    manifest = json.loads(found["manifest.json"])
+    del manifest["animation"]
+    assert manifest == json.loads(still.pop("manifest.json"))
+    assert {name: found[name] for name in still} == still
 
 
 def test_what_cannot_follow_a_pose_is_refused(arm: Animation, tmp_path: Path) -> None:
