@@ -134,17 +134,23 @@ def verify(call: Call) -> None:
 
     folder = Path(call.file("a dataset or a run folder"))
     folder = folder / "dataset" if (folder / "dataset").is_dir() else folder
-    description, manifest = read_description(folder), Manifest(folder)
-    faults = manifest.damaged()
-    faults += [f"{name}: not baked yet" for name in expected_files(description) if name not in manifest.entries]
-    if faults:
-        for fault in faults:
-            print(fault)
+    poses = [] if (folder / "dataset.json").exists() else sorted(path.parent for path in folder.glob("*-*/dataset.json"))
+    damaged, expected, whole = list[str](), 0, list[str]()
+    for part in poses or [folder]:
+        description, manifest = read_description(part), Manifest(part)
+        names = expected_files(description)
+        faults = manifest.damaged()
+        faults += [f"{name}: not baked yet" for name in names if name not in manifest.entries]
+        damaged += [f"{part.name}/{fault}" if poses else fault for fault in faults]
+        expected += len(names)
+        whole.append(f"{part}: {len(manifest.entries)} files whole")
+    if damaged:
+        print("\n".join(damaged))
         raise UserError(
-            f"{folder}: got {len(faults)} faulty files of {len(expected_files(description))}; "
+            f"{folder}: got {len(damaged)} faulty files of {expected}; "
             "delete the damaged ones and run the bake again to make them anew"
         )
-    print(f"{folder}: {len(manifest.entries)} files whole")
+    print("\n".join(whole))
 
 
 def doctor(call: Call) -> None:

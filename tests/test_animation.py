@@ -23,6 +23,8 @@ from ddprt.export.deployed import export_model
 from ddprt.export.viewer.pack import pack
 from ddprt.files import read_tensors, write_tensors
 from ddprt.lights import parse_lighting
+from ddprt.pipeline_animation import AnimatedRun
+from ddprt.pipeline_inspect import describe
 from ddprt.report.animated import at_pose, maps, noise, poses, score, table
 from ddprt.runtime.animated import AnimatedModel
 from ddprt.runtime.animated_file import load_animated
@@ -243,9 +245,31 @@ def test_between_keys_matrices_are_mixed_and_places_follow(models: dict[str, Ani
     for time in (-0.01, 0.51, float("nan")):
         with pytest.raises(UserError, match=r"expected 0 to 0\.5"):
             each.at(time)
-    for wrong in (exact[:-1], exact * np.nan):
-        with pytest.raises(UserError, match="a row for each vertex"):
-            each.at(0.4, wrong)
+    np.testing.assert_array_equal(each.at(0.4, exact.tolist()).occluders, bent.occluders)
+
+
+def test_moments_that_are_none_are_refused(models: dict[str, AnimatedModel], arm: Animation) -> None:
+    model, exact = models["each"], arm.motion(0.4)
+    mirrored = replace(model, positions=np.stack([model.positions[0], -model.positions[0]]))
+    table = [
+        (lambda: model.at(0.4, exact[:-1]), r"positions: got shape .*, a row for each vertex"),
+        (lambda: model.at(0.4, exact * np.nan), r"positions: got vertex 0 at \[nan, nan, nan\], expected finite metres"),
+        (lambda: model.at(0.4, exact * 1e30), r"positions: got vertex 0 at"),
+        (lambda: model.at(0.4, exact * 0), r"positions: got \d+ triangles without area"),
+        (lambda: model.at(0.4, exact * [1.0, 1.0, 0.0]), r"positions: got \d+ triangles without area.*mend the pose"),
+        (lambda: model.at(0.4, "soon"), "positions: got 'soon', expected an array of numbers"),
+        (lambda: mirrored.at(0.25), r"the pose straight between keyframes at 0.25 s: got \d+ triangles.*pass positions"),
+        (lambda: model.at("x"), r"time: got 'x', expected 0 to 0\.5"),
+        (lambda: model.at(None), "time: got None, expected 0"),
+        (lambda: model.at(True), "time: got True, expected 0"),
+        (lambda: model.relight(LAMP, time=[0, 1]), r"time: got \[0, 1\], expected 0"),
+    ]
+    for work, says in table:
+        with pytest.raises(UserError, match=says) as caught:
+            work()
+        assert "\n" not in str(caught.value)
+    assert mirrored.at(0.25, exact).occluders.shape == (len(arm.scene.triangles), 3, 3)
+    assert model.at(0).area.shape == model.at(np.float32(0.25)).area.shape
 
 
 def test_saved_is_loaded(models: dict[str, AnimatedModel], tmp_path: Path) -> None:
@@ -413,11 +437,56 @@ def test_what_cannot_follow_a_pose_is_refused(arm: Animation, tmp_path: Path) ->
     for text, says in (
         ("[animation]\nkeys = -1", "animation.keys"),
         ("[animation]\nbetween = [1.0]", "animation.between"),
+        ("[animation]\nbetween = [0, 1]", r"animation.between: got 0, expected shares above 0 and below 1; leave it out"),
         ('[animation]\nmatrices = "some"', "animation.matrices"),
     ):
         (tmp_path / "bad.toml").write_text(text)
         with pytest.raises(UserError, match=says):
             load_config(tmp_path / "bad.toml")
+
+
+def test_a_clip_may_be_a_number(tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_text("[animation]\nclip = 1")
+    assert load_config(tmp_path / "a.toml").animation.clip == load_config(None, {"animation.clip": "1"}).animation.clip == "1"
+
+
+def test_verbs_that_know_no_poses_say_so_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "arm.toml").write_text(job().to_toml())
+    table = [
+        (("export", "--table"), "--table: got an animation, expected a scene that stands still"),
+        (("eval", "--budget"), "--budget: got an animation"),
+        (("bake", "--dry-run"), "--dry-run: got an animation"),
+        (("bench", "--effects"), "--effects: got an animation"),
+        (("bench", "--leagues"), "--leagues and --splits: got an animation"),
+    ]
+    for (verb, flag), says in table:
+        assert call(verb, tmp_path / "arm.toml", flag, "--out", tmp_path / "run", "--quiet") == 2
+        error = capsys.readouterr().err
+        assert says in error
+        assert error.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+
+
+def test_all_poses_are_verified(data: AnimatedData, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call("verify", data.folder) == 0
+    out = capsys.readouterr().out
+    assert [line.split(":")[0].split("/")[-1] for line in out.splitlines()] == ["between-00", "key-00", "key-01"]
+    shutil.copytree(data.folder, tmp_path / "run" / "dataset")
+    (tmp_path / "run" / "dataset" / "key-01" / "indirect" / "000001.exr").write_bytes(b"")
+    assert call("verify", tmp_path / "run") == 2
+    found = capsys.readouterr()
+    assert "key-01/indirect/000001.exr" in found.out
+    assert "got 1 faulty files" in found.err
+
+
+def test_what_an_animation_leaves_out_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str], data: AnimatedData) -> None:
+    config = job(methods={"compare": ["svd-ridge", "mean", "mlp"]})
+    AnimatedRun(config, tmp_path, quiet=False).fit(data)
+    assert "methods.compare: mean, mlp left out: with an animation" in capsys.readouterr().err
+    (tmp_path / "arm.toml").write_text(job(animation={"keys": [0.0, 0.5, 0.75]}).to_toml())
+    words = describe(str(tmp_path / "arm.toml"), {})
+    assert "animation   3 keyframes, at 0, 0.5, 0.75 s, each with a bake as below" in words
+    assert "2 poses between with 5 lightings each" in words
 
 
 def test_scenes_that_stand_still_know_nothing_of_it(arm: Animation) -> None:

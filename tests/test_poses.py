@@ -269,14 +269,42 @@ def test_poses_that_are_none(tmp_path: Path) -> None:
         (lambda: load_animation("bending", clip="wave"), "animation.clip"),
         (lambda: load_animation("bending", keys=[0.0, 0.5]).pose(0.75), "got 0.75 s, expected 0 to 0.5"),
         (lambda: chosen_times(2, (1.0, 1.0)), "takes no time"),
-        (lambda: posed(build("plates"), np.zeros((3, 3)), "key 1"), "got 3 vertices"),
-        (lambda: posed(build("plates"), build("plates").positions * np.nan, "key 1"), "not finite"),
+        (lambda: load_animation([first, first], keys=[0, 10]), r"keys = \[0, 10\].*files are keyframes a second apart"),
+        (lambda: load_animation([first, first], keys=-1), "2 files beside animation.keys = -1"),
+        (lambda: load_animation([first], keys=True), "1 files beside animation.keys = True"),
+        (lambda: load_animation([first], rings=3), "got parameter rings, expected none for files"),
+        (lambda: load_animation(None), "load_animation: got None, expected a name"),
+        (lambda: load_animation([None, 1]), r"load_animation: got \[None, 1\], expected a name"),
+        (lambda: load_animation("bending", fog={"mean_free_path": 1.0}), "fog: got fog about an animation"),
+        (lambda: load_animation("bending", keys=-1), "got -1, expected rising seconds.* or a number of keyframes up to 256"),
+        (lambda: load_animation("bending", keys=257), "got 257, expected rising seconds"),
+        (lambda: load_animation("bending", keys=True), "got True, expected rising seconds"),
+        (lambda: load_animation("bending", keys="all"), "got 'all', expected rising seconds"),
+        (lambda: load_animation("bending", keys=None), "got None, expected rising seconds"),
+        (lambda: load_animation("bending", clip=True), "animation.clip: got True, expected the name or the number"),
+        (lambda: load_animation("bending", clip=[1]), r"animation.clip: got \[1\], expected the name or the number"),
+        (lambda: posed(build("plates"), np.zeros((3, 3)), "key 1"), r'key 1 of "plates": got shape \(3, 3\)'),
+        (lambda: posed(build("plates"), build("plates").positions * np.nan, "key 1"), r"got vertex 0 at \[nan, nan, nan\]"),
+        (lambda: posed(build("plates"), [["a"]], "key 1"), "expected an array of numbers"),
         (lambda: posed(build("plates"), build("plates").positions * [0.0, 1, 1], "key 1"), "triangles without area"),
     ]
     for work, says in table:
         with pytest.raises(UserError, match=says) as caught:
             work()
         assert "\n" not in str(caught.value)
+
+
+def test_odd_settings_are_no_damage_to_a_file(tmp_path: Path) -> None:
+    """A sound file is not called damaged for what was asked of it, and a clip is found by its number."""
+    writer = creature()
+    first = writer.json["animations"][0]
+    writer.json["animations"].append({"name": "rise", "channels": first["channels"][1:2], "samplers": first["samplers"]})
+    path = writer.glb(tmp_path / "two.glb")
+    assert load_animation(path, clip=1).motion(0.5).tolist() == load_animation(path, clip="1").motion(0.5).tolist()
+    assert not np.array_equal(load_animation(path, clip=1).positions, load_animation(path, clip=0).positions)
+    for keys in (2.5, [0.5, np.nan], [np.nan], -1, [[0.0]], []):
+        with pytest.raises(UserError, match=r"animation\.keys: got .*, expected rising seconds from 0 to"):
+            load_animation(path, keys=keys)
 
 
 @pytest.fixture(scope="module")
