@@ -25,7 +25,7 @@ from ddprt.files import read_tensors, write_tensors
 from ddprt.lights import parse_lighting
 from ddprt.pipeline_animation import AnimatedRun
 from ddprt.pipeline_inspect import describe
-from ddprt.report.animated import at_pose, maps, noise, poses, score, table
+from ddprt.report.animated import at_pose, maps, noise, picture, poses, score, table
 from ddprt.runtime.animated import AnimatedModel
 from ddprt.runtime.animated_file import load_animated
 from ddprt.runtime.train import fit_config
@@ -354,6 +354,9 @@ def test_scores_are_those_of_the_poses(data: AnimatedData, models: dict[str, Ani
     assert 0 < noise(data) < 1
     light, truth = maps(at_pose(models["each"], "each", poses(data)[1]), data.between[0][1])
     assert light.shape == truth.reference.shape
+    whole, learned = (picture(models["each"], seen[1], 0, 24, lamps=lamps) for lamps in (True, False))
+    np.testing.assert_array_equal(whole["difference"], learned["difference"])
+    assert (whole["reference"][..., :3] != learned["reference"][..., :3]).any()
 
 
 def documented(name: str) -> dict[str, Any]:
