@@ -116,6 +116,8 @@ def view(call: Call) -> None:
         raise UserError(f"--html: got {out}, expected a path that ends in .html; name it so")
     if not (port.isascii() and port.isdigit() and int(port) < 1 << 16):
         raise UserError(f"--port: got {port}, expected a whole number from 0 to 65535; 0 takes a free one")
+    if call.asks("time") and call.asks("dataset"):
+        raise UserError("--dataset: got one beside --time, expected none: a pose has other texels than its model; leave it out")
     folder = Path(call.file("a model folder such as runs/cornell/model.ddprt"))
     model = _model_at(call, folder / "model.ddprt" if (folder / "model.ddprt").is_dir() else folder)
     data = open_dataset(call.options["dataset"]) if call.asks("dataset") else None

@@ -110,6 +110,7 @@ def test_a_model_that_moves_is_viewed_at_a_time(tmp_path: Path, capsys: pytest.C
         ((tmp_path,), "ddprt view: got an animation and no --time"),
         ((still, "--time", "0"), "ddprt view: got --time and a model that stands still"),
         ((tmp_path, "--time", "3"), "got 3 s, expected 0 to 0.5"),
+        ((tmp_path, "--time", "0", "--dataset", tmp_path), "--dataset: got one beside --time, expected none"),
     ):
         assert call("view", *words, "--html", page) == 2
         error = capsys.readouterr().err
