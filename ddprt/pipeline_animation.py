@@ -19,6 +19,17 @@ from ddprt.progress import Progress
 from ddprt.scene.poses import Animation, configured_animation
 from ddprt.transport.effects import plan
 
+_TYPED = {
+    "forecast": "--dry-run",
+    "budget": "--budget",
+    "format_table": "--table",
+    "ablate": "--effects",
+    "sweep": "ddprt bench",
+    "scene": "--leagues and --splits",
+    "tune": "ddprt tune",
+}
+"""Steps that only a run of what stands still has, as they are asked for."""
+
 
 class AnimatedRun:
     """One run folder of an animation, and the steps that fill it; see `pipeline.Run`, whose steps have the same names.
@@ -59,6 +70,10 @@ class AnimatedRun:
         """Fits the matrices that are asked for, and saves the first; returns models and seconds by name."""
         from ddprt.runtime.train_animated import fit_animation
 
+        if others := [name for name in self.config.methods.compare if name != "svd-ridge"]:
+            self.progress.say(
+                f"methods.compare: {', '.join(others)} left out: with an animation, matrices of svd-ridge are compared"
+            )
         with self.progress.stage("fit svd-ridge") as stage:
             begun = time.perf_counter()
             models = fit_animation(data, self.config)
@@ -141,7 +156,8 @@ class AnimatedRun:
         if name.startswith("_"):
             raise AttributeError(name)
         raise UserError(
-            f"{name}: got an animation, expected a scene that stands still; set animation.keys = 0, or bake, fit, eval, export"
+            f"{_TYPED.get(name, name)}: got an animation, expected a scene that stands still; set animation.keys = 0, or bake, "
+            "fit, eval, export"
         )
 
     def _check(self) -> None:

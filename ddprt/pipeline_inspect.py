@@ -42,6 +42,8 @@ def describe(source: str, overrides: dict[str, str]) -> str:
         *(f"material    {m.name}: albedo {np.round(m.albedo, 4).tolist()}{', textured' if m.texture is not None else ''}"
           for m in scene.materials),
     ]  # fmt: skip
+    if config.animated:
+        lines.append(_poses(config))
     tracer = Tracer.of(scene)
     atlas, hidden = build_open_atlas(tracer, scene, config.atlas.resolution, config.atlas.padding)
     charts, of = len(np.unique(atlas.chart)), "" if scene.lightmap is None else " of the file"
@@ -78,6 +80,18 @@ def describe(source: str, overrides: dict[str, str]) -> str:
             bake, costs = bake + told, {**foreseen, **costs}
     known = [line for line in effects.lines(costs) if lightings or not line.split(":")[0].endswith(" lights")]
     return "\n".join([*lines, *(f"effect      {line}" for line in known), *bake])
+
+
+def _poses(config: Config) -> str:
+    """How many bakes an animation makes, of which one is looked at."""
+    from ddprt.scene.poses import configured_animation
+
+    animation = configured_animation(config)
+    times, between = ", ".join(f"{time:g}" for time in animation.times), len(animation.between(config.animation.between))
+    return (
+        f"animation   {animation.keys} keyframes, at {times} s, each with a bake as below, which is that of the first; "
+        f"{between} poses between with {2 + config.lightings.test} lightings each"
+    )
 
 
 def _foreseen(scene: Any, config: Config) -> tuple[list[str], dict[str, str]]:

@@ -62,13 +62,27 @@ class AnimationConfig(Section):
     keys: Annotated[int, Field(ge=0, le=256)] | tuple[float, ...] = Field(
         0, description="how many, evenly over the motion, or their times in seconds; 0: the scene stands still"
     )
-    between: tuple[Annotated[float, Field(gt=0.0, lt=1.0)], ...] = Field(
+    between: tuple[float, ...] = Field(
         (0.5,), description="shares of the way from key to key at which poses are tested that nobody learned from"
     )
     matrices: Literal["one", "each", "both"] = Field(
         "both", description="transfer matrices: one for all keys, one for each, or both compared and those of each kept"
     )
     clip: str = Field("", description="name or number of the animation in a glTF file; empty: the first")
+
+    @field_validator("between")
+    @classmethod
+    def _on_the_way(cls, shares: tuple[float, ...]) -> tuple[float, ...]:
+        if wrong := [share for share in shares if not 0 < share < 1]:
+            raise ValueError(
+                f"got {wrong[0]:g}, expected shares above 0 and below 1; leave it out, keyframes are tested anyway"
+            )
+        return shares
+
+    @field_validator("clip", mode="before")
+    @classmethod
+    def _by_number(cls, name: Any) -> Any:
+        return str(name) if isinstance(name, int) and not isinstance(name, bool) else name
 
 
 class AtlasConfig(Section):

@@ -43,10 +43,11 @@ def fit(call: Call) -> None:
 def evaluate(call: Call) -> None:
     """score all methods on held-out lightings and write the report"""
     job = call.run()
+    take_apart = job.budget if call.asks("budget") else None  # what moves has none, which is told before the work
     data = job.dataset(shines=True)
     models, seconds = job.fit(data)
     evaluation = job.evaluate(data, models, seconds)
-    budget = job.budget(data, models) if call.asks("budget") else None
+    budget = None if take_apart is None else take_apart(data, models)
     report = job.report(data, models, evaluation, budget=budget)
     if budget is not None:
         from ddprt.bench.budget.budget import table
@@ -94,13 +95,14 @@ def leagues(call: Call) -> None:
 
     names = split_names(call.options["splits"]) if call.asks("splits") else []
     job = call.run()
+    scene = job.scene  # what moves has none, which is told before the bake
     data, folder, found = job.bake(), job.folder / "bench", []
     if names:
-        found = told(Generalisation(job.config, data, job.scene, folder, job.progress).run(names), names)
+        found = told(Generalisation(job.config, data, scene, folder, job.progress).run(names), names)
         write_text(folder / "splits.md", markdown(found, job.config.scene.name))
         print(f"splits:   {folder / 'splits.md'}")
     if call.asks("leagues"):
-        results, table, page = leagues(job.config, data, job.scene, folder, job.progress, splits=found)[1]
+        results, table, page = leagues(job.config, data, scene, folder, job.progress, splits=found)[1]
         print(f"results:  {results}\ntable:    {table}\npage:     {page}")
 
 
@@ -157,12 +159,13 @@ def export(call: Call) -> None:
     if call.asks("gltf"):
         call.overrides["export.gltf"] = "true"
     job = call.run()
+    table = job.format_table if call.asks("table") else None  # as in `evaluate`
     folder = job.folder / "model.ddprt"
     model = load_animated(folder) if is_animated(folder) else load_model(folder)
     job.export(model)
     print(f"textures: {job.folder / 'export'}")
-    if call.asks("table"):
-        print(f"{job.format_table(model)}\ntable:    {job.folder / 'export' / 'formats.json'}")
+    if table is not None:
+        print(f"{table(model)}\ntable:    {job.folder / 'export' / 'formats.json'}")
 
 
 @dataclass(frozen=True)

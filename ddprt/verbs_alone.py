@@ -116,6 +116,8 @@ def view(call: Call) -> None:
         raise UserError(f"--html: got {out}, expected a path that ends in .html; name it so")
     if not (port.isascii() and port.isdigit() and int(port) < 1 << 16):
         raise UserError(f"--port: got {port}, expected a whole number from 0 to 65535; 0 takes a free one")
+    if call.asks("time") and call.asks("dataset"):
+        raise UserError("--dataset: got one beside --time, expected none: a pose has other texels than its model; leave it out")
     folder = Path(call.file("a model folder such as runs/cornell/model.ddprt"))
     model = _model_at(call, folder / "model.ddprt" if (folder / "model.ddprt").is_dir() else folder)
     data = open_dataset(call.options["dataset"]) if call.asks("dataset") else None
@@ -134,17 +136,23 @@ def verify(call: Call) -> None:
 
     folder = Path(call.file("a dataset or a run folder"))
     folder = folder / "dataset" if (folder / "dataset").is_dir() else folder
-    description, manifest = read_description(folder), Manifest(folder)
-    faults = manifest.damaged()
-    faults += [f"{name}: not baked yet" for name in expected_files(description) if name not in manifest.entries]
-    if faults:
-        for fault in faults:
-            print(fault)
+    poses = [] if (folder / "dataset.json").exists() else sorted(path.parent for path in folder.glob("*-*/dataset.json"))
+    damaged, expected, whole = list[str](), 0, list[str]()
+    for part in poses or [folder]:
+        description, manifest = read_description(part), Manifest(part)
+        names = expected_files(description)
+        faults = manifest.damaged()
+        faults += [f"{name}: not baked yet" for name in names if name not in manifest.entries]
+        damaged += [f"{part.name}/{fault}" if poses else fault for fault in faults]
+        expected += len(names)
+        whole.append(f"{part}: {len(manifest.entries)} files whole")
+    if damaged:
+        print("\n".join(damaged))
         raise UserError(
-            f"{folder}: got {len(faults)} faulty files of {len(expected_files(description))}; "
+            f"{folder}: got {len(damaged)} faulty files of {expected}; "
             "delete the damaged ones and run the bake again to make them anew"
         )
-    print(f"{folder}: {len(manifest.entries)} files whole")
+    print("\n".join(whole))
 
 
 def doctor(call: Call) -> None:

@@ -82,21 +82,24 @@ def measure(keys: int, quick: bool, folder: str) -> tuple[dict[str, Any], Animat
 
 
 def draw(data: AnimatedData, model: AnimatedModel, path: Path) -> None:
-    """Reference, relit and difference of every pose."""
+    """A keyframe and the poses about it that nobody learned from, indirect light alone, each under a sun of its own."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    shown = poses(data)
-    figure, axes = plt.subplots(3, len(shown), figsize=(2.3 * len(shown), 5.4), layout="constrained")
-    for column, pose in zip(axes.T, shown, strict=True):
-        for axis, (name, image) in zip(column, picture(model, pose, 1, 260).items(), strict=True):
-            axis.imshow(np.clip(image, 0, 1))
-            axis.axis("off")
-            if column is axes.T[0]:
-                axis.set_title(name, loc="left", fontsize=8)
-        column[0].set_title(f"{pose.time:.2f} s, {'key' if pose.seen else 'between'}", fontsize=8)
+    shown = [pose for pose in poses(data) if 0 < pose.time < 1]
+    shots = [picture(model, pose, 1, 330, lamps=False) for pose in shown]
+    seen = np.logical_or.reduce([image[..., 3] > 0 for shot in shots for image in shot.values()])
+    rows, columns = (np.flatnonzero(seen.any(axis)) for axis in (1, 0))
+    figure, axes = plt.subplots(len(shown), 3, figsize=(9.6, 2.1 * len(shown)), layout="constrained")
+    for row, pose, shot in zip(axes, shown, shots, strict=True):
+        for axis, (name, image) in zip(row, shot.items(), strict=True):
+            axis.imshow(np.clip(image[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1], 0, 1))
+            axis.set(xticks=[], yticks=[], frame_on=False)
+            if pose is shown[0]:
+                axis.set_title(f"{name} x 4" if name == "difference" else f"{name}, indirect light", fontsize=10)
+        row[0].set_ylabel(f"{pose.time:.2f} s, {'a keyframe' if pose.seen else 'between'}", fontsize=10)
     figure.savefig(path, dpi=90)
 
 

@@ -1,10 +1,13 @@
 """A bake of poses, one basis of them all, matrices for each or for all: laws, closed forms, and the way through the verbs."""
 
 import json
+import re
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,21 +16,31 @@ from small_job import call
 import ddprt
 from ddprt.config import Config, checked, load_config
 from ddprt.dataset.animated import AnimatedData, bake_animation, open_animation, refuse_still
+from ddprt.dataset.store import open_dataset
 from ddprt.errors import UserError
-from ddprt.export.animated import FILE, export_animated
-from ddprt.files import read_tensors
+from ddprt.export.animated import export_animated
+from ddprt.export.deployed import export_model
+from ddprt.export.viewer.pack import pack
+from ddprt.files import read_tensors, write_tensors
 from ddprt.lights import parse_lighting
-from ddprt.report.animated import at_pose, maps, noise, poses, score, table
+from ddprt.pipeline_animation import AnimatedRun
+from ddprt.pipeline_inspect import describe
+from ddprt.report.animated import at_pose, maps, noise, picture, poses, score, table
 from ddprt.runtime.animated import AnimatedModel
 from ddprt.runtime.animated_file import load_animated
 from ddprt.runtime.train import fit_config
 from ddprt.runtime.train_animated import fit_animation
+from ddprt.sampling.points import Samples
+from ddprt.scene.exr import write_exr
 from ddprt.scene.library import build
 from ddprt.scene.material import Material
 from ddprt.scene.poses import Animation, load_animation, posed
 from ddprt.scene.shapes import box, faceted, rectangle
 from ddprt.transport.effects import plan
+from ddprt.transport.embree import Tracer
+from ddprt.transport.measure import measure
 
+DOCS = Path(__file__).parent.parent / "docs"
 ARM = {"rings": 6, "around": 6}
 RIDGE = 1e-3
 JOB = {
@@ -123,6 +136,52 @@ def test_every_pose_has_its_own_light_and_the_same_texels(data: AnimatedData, ar
         open_animation(arm, job(), data.folder / "nowhere")
 
 
+LAMP = [{"type": "point", "position": [0.4, 1.1, 0.3], "intensity": [1, 2, 0.5]}]
+
+
+def home_of_the_first_pose(data: AnimatedData) -> np.ndarray:
+    """The point of each sample, 12 points, by a loop over the first pose."""
+    first = data.keys[0].samples
+    spread = first.spacing * np.sqrt(2)
+    place, turned = (np.linalg.norm(part[:, None] - part[None, :12], axis=2) for part in (first.position, first.normal))
+    found = np.hypot(place / spread, turned / np.sqrt(2)).argmin(1)
+    return np.where(np.arange(len(found)) < 12, np.arange(len(found)), found)
+
+
+def grouped(light: np.ndarray, samples: Samples, home: np.ndarray) -> np.ndarray:
+    return np.stack([(light * samples.albedo)[home == point].mean(0) for point in range(12)])
+
+
+def test_samples_stay_with_their_points(data: AnimatedData, models: dict[str, AnimatedModel], tmp_path: Path) -> None:
+    """In the datasets of all poses, in a model of any moment, and in what is saved of that."""
+    home = home_of_the_first_pose(data)
+    moved = data.keys[1].samples
+    assert (replace(moved, rest=None).nearest_point(12) != home).any(), "by nearness in its own pose one would change"
+    for part in (*data.keys, data.between[0][1], *data.wide):
+        again = part if part in data.wide else open_dataset(part.folder)
+        light = again.measured([0])[0]
+        np.testing.assert_allclose(again.values([0], 12, "radiosity")[0], grouped(light, again.samples, home), rtol=2e-6)
+    lamp = parse_lighting(LAMP)
+    for time in (0.0, 0.4, 0.5):
+        model = models["each"].at(time)
+        model.save(tmp_path / "moment")
+        models["each"].save(tmp_path / "all")
+        for found in (model, load_animated(tmp_path / "all").at(time), ddprt.load_model(tmp_path / "moment")):
+            samples = found.samples
+            light = measure(Tracer(found.occluders), lamp, samples.position, samples.normal, seed=0, depth=samples.depth)
+            np.testing.assert_allclose(found.measure(LAMP), grouped(light, samples, home), rtol=2e-6, atol=1e-9)
+
+
+def test_older_bakes_whose_samples_change_their_points_are_refused(data: AnimatedData, arm: Animation, tmp_path: Path) -> None:
+    shutil.copytree(data.folder, tmp_path / "old")
+    path = tmp_path / "old" / "key-01" / "points.safetensors"
+    tensors = {name: array for name, array in read_tensors(path).items() if not name.startswith("rest.")}
+    assert len(tensors) == 5
+    write_tensors(path, tensors)
+    with pytest.raises(UserError, match=r"key-01: got samples of an older version.*bake again into another --out"):
+        open_animation(arm, job(), tmp_path / "old")
+
+
 def slow_fit(data: AnimatedData, keys: list[int], U: np.ndarray, area: np.ndarray) -> np.ndarray:
     """M of the red channel: ridge regression of projections on measurements, in float64 with loops over keyframes."""
     D, C = [], []
@@ -148,6 +207,13 @@ def test_transfers_are_ridge_regressions_onto_one_basis(data: AnimatedData, mode
     for k in (0, 1):
         np.testing.assert_allclose(each.matrix[k, 0], slow_fit(data, [k], U, area), atol=2e-4 * np.abs(each.matrix).max())
     np.testing.assert_allclose(one.matrix[0, 0], slow_fit(data, [0, 1], U, area), atol=2e-4 * np.abs(one.matrix).max())
+
+
+def test_albedo_is_kept_to_be_shown(data: AnimatedData, models: dict[str, AnimatedModel]) -> None:
+    model = models["one"].at(0.2)
+    for part in data.keys:
+        np.testing.assert_array_equal(model.image(model.albedo)[part.covered], part.gbuffer["albedo"])
+    assert not any("albedo" in note for note in pack(model)["notes"])
 
 
 def test_the_basis_is_the_best_of_all_keys_together(data: AnimatedData, models: dict[str, AnimatedModel]) -> None:
@@ -179,9 +245,31 @@ def test_between_keys_matrices_are_mixed_and_places_follow(models: dict[str, Ani
     for time in (-0.01, 0.51, float("nan")):
         with pytest.raises(UserError, match=r"expected 0 to 0\.5"):
             each.at(time)
-    for wrong in (exact[:-1], exact * np.nan):
-        with pytest.raises(UserError, match="a row for each vertex"):
-            each.at(0.4, wrong)
+    np.testing.assert_array_equal(each.at(0.4, exact.tolist()).occluders, bent.occluders)
+
+
+def test_moments_that_are_none_are_refused(models: dict[str, AnimatedModel], arm: Animation) -> None:
+    model, exact = models["each"], arm.motion(0.4)
+    mirrored = replace(model, positions=np.stack([model.positions[0], -model.positions[0]]))
+    table = [
+        (lambda: model.at(0.4, exact[:-1]), r"positions: got shape .*, a row for each vertex"),
+        (lambda: model.at(0.4, exact * np.nan), r"positions: got vertex 0 at \[nan, nan, nan\], expected finite metres"),
+        (lambda: model.at(0.4, exact * 1e30), r"positions: got vertex 0 at"),
+        (lambda: model.at(0.4, exact * 0), r"positions: got \d+ triangles without area"),
+        (lambda: model.at(0.4, exact * [1.0, 1.0, 0.0]), r"positions: got \d+ triangles without area.*mend the pose"),
+        (lambda: model.at(0.4, "soon"), "positions: got 'soon', expected an array of numbers"),
+        (lambda: mirrored.at(0.25), r"the pose straight between keyframes at 0.25 s: got \d+ triangles.*pass positions"),
+        (lambda: model.at("x"), r"time: got 'x', expected 0 to 0\.5"),
+        (lambda: model.at(None), "time: got None, expected 0"),
+        (lambda: model.at(True), "time: got True, expected 0"),
+        (lambda: model.relight(LAMP, time=[0, 1]), r"time: got \[0, 1\], expected 0"),
+    ]
+    for work, says in table:
+        with pytest.raises(UserError, match=says) as caught:
+            work()
+        assert "\n" not in str(caught.value)
+    assert mirrored.at(0.25, exact).occluders.shape == (len(arm.scene.triangles), 3, 3)
+    assert model.at(0).area.shape == model.at(np.float32(0.25)).area.shape
 
 
 def test_saved_is_loaded(models: dict[str, AnimatedModel], tmp_path: Path) -> None:
@@ -192,14 +280,21 @@ def test_saved_is_loaded(models: dict[str, AnimatedModel], tmp_path: Path) -> No
         np.testing.assert_array_equal(again.relight(light, time=0.3), model.relight(light, time=0.3))
         assert again.nbytes == model.nbytes
         assert again.statuses == model.statuses
-    at_rest = ddprt.load_model(tmp_path / "each")
-    np.testing.assert_array_equal(at_rest.relight(light), models["each"].relight(light, time=0.0))
-    models["one"].rest.save(tmp_path / "each")
+    with pytest.raises(UserError, match=r"each: got a model of an animation, expected .* ddprt\.load_animated"):
+        ddprt.load_model(tmp_path / "each")
+    models["one"].rest.save(tmp_path / "rest")
+    for name in ("model.json", "tensors.safetensors"):
+        shutil.copy(tmp_path / "rest" / name, tmp_path / "each" / name)
     with pytest.raises(UserError, match=r"tensors\.safetensors is not what was saved with it"):
         load_animated(tmp_path / "each")
+    models["one"].rest.save(tmp_path / "each")  # in its place, a model that stands still
+    at_rest = ddprt.load_model(tmp_path / "each")
+    np.testing.assert_array_equal(at_rest.relight(light), models["one"].relight(light, time=0.0))
+    with pytest.raises(UserError, match=r"got no animation\.json"):
+        load_animated(tmp_path / "each")
     for damage, says in (
-        (lambda text: text.replace('"schema": 1', '"schema": 9'), "schema 9"),
-        (lambda text: text.replace("spacing", "spicing"), "spacing"),
+        (lambda text: text.replace('"schema": 2', '"schema": 1'), "schema 1, expected 2; fit it again"),
+        (lambda text: text.replace("statuses", "statutes"), "statuses"),
         (lambda text: text[: len(text) // 2], "animation.json: got"),
     ):
         models["one"].save(tmp_path / "one")
@@ -226,6 +321,8 @@ def test_texels_that_a_pose_buries_are_dark_there_and_kept(tmp_path: Path) -> No
     hidden = up & ~down
     assert hidden.sum() > 20
     np.testing.assert_array_equal(data.covered, up | down)
+    assert (data.keys[1].gbuffer["albedo"] == np.float32(0.6)).all()
+    np.testing.assert_array_equal(data.albedo, np.full((len(data.albedo), 3), 0.6, np.float32))
     lost = hidden[data.covered]
     light = data.wide[1].maps("indirect", [0, 1])
     assert not light[:, lost].any()
@@ -257,27 +354,73 @@ def test_scores_are_those_of_the_poses(data: AnimatedData, models: dict[str, Ani
     assert 0 < noise(data) < 1
     light, truth = maps(at_pose(models["each"], "each", poses(data)[1]), data.between[0][1])
     assert light.shape == truth.reference.shape
+    whole, learned = (picture(models["each"], seen[1], 0, 24, lamps=lamps) for lamps in (True, False))
+    np.testing.assert_array_equal(whole["difference"], learned["difference"])
+    assert (whole["reference"][..., :3] != learned["reference"][..., :3]).any()
 
 
-def test_export_holds_every_key(models: dict[str, AnimatedModel], tmp_path: Path) -> None:
-    """Decoded from the files alone, by the steps of the manifest."""
-    model = models["each"]
-    export_animated(model, tmp_path, precision="float", stitch=False)
-    manifest, found = json.loads((tmp_path / "manifest.json").read_text()), read_tensors(tmp_path / FILE)
-    assert manifest["animation"]["keys"] == manifest["animation"]["matrices"] == 2
-    still = read_tensors(tmp_path / "transfer.safetensors")
-    np.testing.assert_array_equal(found["matrix"][0], still["matrix"])
-    values = np.random.default_rng(0).random((12, 3))
-    basis = np.asarray(model.rest.relighter.basis) / np.array(manifest["basis_scale"])[:, None]
-    for time in (0.0, 0.2, 0.5):
-        k = min(int(np.searchsorted(found["times"], time, side="right")) - 1, 0)
-        t = (time - found["times"][k]) / (found["times"][k + 1] - found["times"][k])
-        M = (1 - t) * found["matrix"][k] + t * found["matrix"][k + 1]
-        size = np.linalg.norm(values, axis=0)
-        light = np.stack([size[c] * np.maximum(basis.T @ (M[c] @ (values[:, c] / size[c])), 0) for c in range(3)], 1)
-        np.testing.assert_allclose(light, model.at(time).predict(values), atol=1e-4 * light.max())
-    for k, time in enumerate(found["times"]):
-        np.testing.assert_allclose(found["position"][k], model.at(float(time)).samples.position, atol=1e-6)
+def documented(name: str) -> dict[str, Any]:
+    """The Python blocks of a page of docs/, executed; of effects.md the one about what moves."""
+    scope: dict[str, Any] = {}
+    for block in re.findall(r"```python\n(.*?)```", (DOCS / name).read_text(), re.DOTALL):
+        if name != "effects.md" or "def moment" in block:
+            exec(block, scope)
+    return scope
+
+
+@pytest.mark.parametrize("way", ["each", "one", "glowing"])
+def test_an_export_is_decoded_by_the_documented_steps(
+    way: str, models: dict[str, AnimatedModel], arm: Animation, tmp_path: Path
+) -> None:
+    """Measured, mixed and lit from the files alone, at keys and between, where the mesh goes straight."""
+    model = models["one" if way == "one" else "each"]
+    if way == "glowing":
+        glow = np.random.default_rng(1).random((2, len(model.rest.area), 3)).astype(np.float32)
+        model = replace(model, constant=glow, rest=replace(model.rest, constant=glow[0]))
+    folder, then = tmp_path / "export", tmp_path / "then"
+    files = export_animated(model, folder, precision="float", stitch=False)
+    assert {path.name for path in files} == {path.name for path in folder.iterdir()}
+    shutil.copytree(folder, then)
+    moment, page = documented("effects.md")["moment"], documented("deployment.md")
+    manifest = json.loads((folder / "manifest.json").read_text())
+    golden = {entry["time"]: entry for entry in json.loads((folder / "animation-golden.json").read_text())["moments"]}
+    assert list(golden) == pytest.approx([0.0, 0.15, 0.5])
+    lamp = parse_lighting(LAMP)
+    for time in (0.0, 0.2, 0.5, *golden):
+        still = model.at(time)
+        transfer, points = moment(folder, time)
+        light = measure(Tracer(still.occluders), lamp, points["position"], points["normal"], seed=0, depth=manifest["depth"])
+        home, size = np.array(points["home"]), np.abs(still.measure(LAMP)).max()
+        x = np.stack([(light * points["albedo"])[home == point].mean(0) for point in range(12)])
+        np.testing.assert_allclose(x, still.measure(LAMP), atol=1e-4 * size)
+        write_tensors(then / "transfer.safetensors", transfer)
+        if way == "glowing":
+            write_exr(then / "constant.exr", points["constant"], half=False)
+        image = page["light"](then, page["frame"](then, x))
+        expected = still.predict(x.astype(np.float32))
+        np.testing.assert_allclose(image[still.covered], expected, atol=1e-4 * expected.max())
+        if time in golden:
+            entry = golden[time]
+            np.testing.assert_allclose(entry["measured"], still.measure(entry["lighting"]), rtol=1e-6)
+            assert np.max(entry["measured"]) > 0
+            rows = page["frame"](then, np.array(entry["values"]))
+            np.testing.assert_allclose(entry["rows"], rows, atol=1e-5 * np.abs(rows).max())
+            lit = page["light"](then, rows)[tuple(np.transpose(entry["texels"]))]
+            np.testing.assert_allclose(entry["light"], lit, atol=1e-4 * lit.max())
+    assert (np.array(golden[0.0]["rows"]) != np.array(golden[0.5]["rows"])).any()
+
+
+def test_an_export_of_what_moves_is_one_of_its_first_pose_and_more(models: dict[str, AnimatedModel], tmp_path: Path) -> None:
+    export_animated(models["each"], tmp_path / "moving")
+    (tmp_path / "moving" / "constant-07.exr").touch()  # of an earlier one, with more keys and a glow
+    export_animated(models["each"], tmp_path / "moving")
+    export_model(models["each"].rest, tmp_path / "still")
+    found, still = ({path.name: path.read_bytes() for path in (tmp_path / name).iterdir()} for name in ("moving", "still"))
+    assert found.keys() - still.keys() == {"animation.safetensors", "animation-golden.json"}
+    manifest = json.loads(found["manifest.json"])
+    del manifest["animation"]
+    assert manifest == json.loads(still.pop("manifest.json"))
+    assert {name: found[name] for name in still} == still
 
 
 def test_what_cannot_follow_a_pose_is_refused(arm: Animation, tmp_path: Path) -> None:
@@ -297,11 +440,56 @@ def test_what_cannot_follow_a_pose_is_refused(arm: Animation, tmp_path: Path) ->
     for text, says in (
         ("[animation]\nkeys = -1", "animation.keys"),
         ("[animation]\nbetween = [1.0]", "animation.between"),
+        ("[animation]\nbetween = [0, 1]", r"animation.between: got 0, expected shares above 0 and below 1; leave it out"),
         ('[animation]\nmatrices = "some"', "animation.matrices"),
     ):
         (tmp_path / "bad.toml").write_text(text)
         with pytest.raises(UserError, match=says):
             load_config(tmp_path / "bad.toml")
+
+
+def test_a_clip_may_be_a_number(tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_text("[animation]\nclip = 1")
+    assert load_config(tmp_path / "a.toml").animation.clip == load_config(None, {"animation.clip": "1"}).animation.clip == "1"
+
+
+def test_verbs_that_know_no_poses_say_so_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "arm.toml").write_text(job().to_toml())
+    table = [
+        (("export", "--table"), "--table: got an animation, expected a scene that stands still"),
+        (("eval", "--budget"), "--budget: got an animation"),
+        (("bake", "--dry-run"), "--dry-run: got an animation"),
+        (("bench", "--effects"), "--effects: got an animation"),
+        (("bench", "--leagues"), "--leagues and --splits: got an animation"),
+    ]
+    for (verb, flag), says in table:
+        assert call(verb, tmp_path / "arm.toml", flag, "--out", tmp_path / "run", "--quiet") == 2
+        error = capsys.readouterr().err
+        assert says in error
+        assert error.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+
+
+def test_all_poses_are_verified(data: AnimatedData, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call("verify", data.folder) == 0
+    out = capsys.readouterr().out
+    assert [line.split(":")[0].split("/")[-1] for line in out.splitlines()] == ["between-00", "key-00", "key-01"]
+    shutil.copytree(data.folder, tmp_path / "run" / "dataset")
+    (tmp_path / "run" / "dataset" / "key-01" / "indirect" / "000001.exr").write_bytes(b"")
+    assert call("verify", tmp_path / "run") == 2
+    found = capsys.readouterr()
+    assert "key-01/indirect/000001.exr" in found.out
+    assert "got 1 faulty files" in found.err
+
+
+def test_what_an_animation_leaves_out_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str], data: AnimatedData) -> None:
+    config = job(methods={"compare": ["svd-ridge", "mean", "mlp"]})
+    AnimatedRun(config, tmp_path, quiet=False).fit(data)
+    assert "methods.compare: mean, mlp left out: with an animation" in capsys.readouterr().err
+    (tmp_path / "arm.toml").write_text(job(animation={"keys": [0.0, 0.5, 0.75]}).to_toml())
+    words = describe(str(tmp_path / "arm.toml"), {})
+    assert "animation   3 keyframes, at 0, 0.5, 0.75 s, each with a bake as below" in words
+    assert "2 poses between with 5 lightings each" in words
 
 
 def test_scenes_that_stand_still_know_nothing_of_it(arm: Animation) -> None:

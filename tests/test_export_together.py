@@ -26,7 +26,7 @@ def moving() -> AnimatedModel:
     """A made-up model of two keyframes, half a second apart, by the second of which it is twice as large."""
     rest = replace(model_of(relighters(5, 3)["plain"]), method="svd-ridge")
     corners = rest.occluders.reshape(-1, 3).astype(np.float64)
-    riders = Riders(np.arange(POINTS) % 2, np.full((POINTS, 3), 1 / 3), np.full((POINTS, 3), 0.5), spacing=0.3)
+    riders = Riders(np.arange(POINTS) % 2, np.full((POINTS, 3), 1 / 3), rest.samples)
     parts = [np.stack([np.asarray(getattr(rest.relighter, name))] * 2) for name in ("matrix", "offset", "intercept")]
     return AnimatedModel(
         rest,
@@ -110,6 +110,7 @@ def test_a_model_that_moves_is_viewed_at_a_time(tmp_path: Path, capsys: pytest.C
         ((tmp_path,), "ddprt view: got an animation and no --time"),
         ((still, "--time", "0"), "ddprt view: got --time and a model that stands still"),
         ((tmp_path, "--time", "3"), "got 3 s, expected 0 to 0.5"),
+        ((tmp_path, "--time", "0", "--dataset", tmp_path), "--dataset: got one beside --time, expected none"),
     ):
         assert call("view", *words, "--html", page) == 2
         error = capsys.readouterr().err

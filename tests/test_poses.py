@@ -1,6 +1,7 @@
 """What moves: clips of glTF files beside a slow twin in loops, files as poses, motions in code, and points that ride along."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from test_scene_files import TRIANGLE, Writer
 
 from ddprt.errors import UserError
-from ddprt.sampling.points import place_samples
+from ddprt.sampling.points import Samples, place_samples
 from ddprt.sampling.riding import place_riders
 from ddprt.scene.atlas import Atlas, build_atlas
 from ddprt.scene.gltf_motion import Channel, load_clip
@@ -268,14 +269,42 @@ def test_poses_that_are_none(tmp_path: Path) -> None:
         (lambda: load_animation("bending", clip="wave"), "animation.clip"),
         (lambda: load_animation("bending", keys=[0.0, 0.5]).pose(0.75), "got 0.75 s, expected 0 to 0.5"),
         (lambda: chosen_times(2, (1.0, 1.0)), "takes no time"),
-        (lambda: posed(build("plates"), np.zeros((3, 3)), "key 1"), "got 3 vertices"),
-        (lambda: posed(build("plates"), build("plates").positions * np.nan, "key 1"), "not finite"),
+        (lambda: load_animation([first, first], keys=[0, 10]), r"keys = \[0, 10\].*files are keyframes a second apart"),
+        (lambda: load_animation([first, first], keys=-1), "2 files beside animation.keys = -1"),
+        (lambda: load_animation([first], keys=True), "1 files beside animation.keys = True"),
+        (lambda: load_animation([first], rings=3), "got parameter rings, expected none for files"),
+        (lambda: load_animation(None), "load_animation: got None, expected a name"),
+        (lambda: load_animation([None, 1]), r"load_animation: got \[None, 1\], expected a name"),
+        (lambda: load_animation("bending", fog={"mean_free_path": 1.0}), "fog: got fog about an animation"),
+        (lambda: load_animation("bending", keys=-1), "got -1, expected rising seconds.* or a number of keyframes up to 256"),
+        (lambda: load_animation("bending", keys=257), "got 257, expected rising seconds"),
+        (lambda: load_animation("bending", keys=True), "got True, expected rising seconds"),
+        (lambda: load_animation("bending", keys="all"), "got 'all', expected rising seconds"),
+        (lambda: load_animation("bending", keys=None), "got None, expected rising seconds"),
+        (lambda: load_animation("bending", clip=True), "animation.clip: got True, expected the name or the number"),
+        (lambda: load_animation("bending", clip=[1]), r"animation.clip: got \[1\], expected the name or the number"),
+        (lambda: posed(build("plates"), np.zeros((3, 3)), "key 1"), r'key 1 of "plates": got shape \(3, 3\)'),
+        (lambda: posed(build("plates"), build("plates").positions * np.nan, "key 1"), r"got vertex 0 at \[nan, nan, nan\]"),
+        (lambda: posed(build("plates"), [["a"]], "key 1"), "expected an array of numbers"),
         (lambda: posed(build("plates"), build("plates").positions * [0.0, 1, 1], "key 1"), "triangles without area"),
     ]
     for work, says in table:
         with pytest.raises(UserError, match=says) as caught:
             work()
         assert "\n" not in str(caught.value)
+
+
+def test_odd_settings_are_no_damage_to_a_file(tmp_path: Path) -> None:
+    """A sound file is not called damaged for what was asked of it, and a clip is found by its number."""
+    writer = creature()
+    first = writer.json["animations"][0]
+    writer.json["animations"].append({"name": "rise", "channels": first["channels"][1:2], "samplers": first["samplers"]})
+    path = writer.glb(tmp_path / "two.glb")
+    assert load_animation(path, clip=1).motion(0.5).tolist() == load_animation(path, clip="1").motion(0.5).tolist()
+    assert not np.array_equal(load_animation(path, clip=1).positions, load_animation(path, clip=0).positions)
+    for keys in (2.5, [0.5, np.nan], [np.nan], -1, [[0.0]], []):
+        with pytest.raises(UserError, match=r"animation\.keys: got .*, expected rising seconds from 0 to"):
+            load_animation(path, keys=keys)
 
 
 @pytest.fixture(scope="module")
@@ -322,6 +351,19 @@ def test_points_ride_on_the_mesh(arm: Animation) -> None:
         np.testing.assert_allclose(moved.position[k], place, atol=1e-12)
         np.testing.assert_allclose(moved.normal[k], across / np.linalg.norm(across), atol=1e-12)
     assert moved.spacing == still.spacing
+
+
+def test_a_sample_stays_with_its_point(arm: Animation) -> None:
+    riders = place_riders(arm.scene, 96, seed=3, atlas=build_atlas(arm.scene, 32))
+    at_rest, moved = (riders.at(arm.key(index).corners, depth=0.5) for index in (0, 2))
+    home = at_rest.nearest_point(12)
+    assert at_rest.rest is None
+    assert (replace(moved, rest=None).nearest_point(12) != home).any(), "by nearness alone some would change"
+    np.testing.assert_array_equal(moved.nearest_point(12), home)
+    kept = Samples.read(moved.tensors, moved.spacing, moved.depth)
+    np.testing.assert_array_equal(kept.nearest_point(12), home)
+    assert kept.digest == moved.digest != replace(moved, rest=None).digest
+    assert (kept.depth, kept.spacing) == (0.5, at_rest.spacing)
 
 
 def test_shading_normals_turn_with_their_faces(statue: Scene) -> None:

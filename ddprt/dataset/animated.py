@@ -59,6 +59,14 @@ class AnimatedData:
         return np.logical_or.reduce([data.covered for data in self.keys])
 
     @cached_property
+    def albedo(self) -> Float32[np.ndarray, "texels 3"]:
+        """Of these texels, each from the first keyframe that shows it."""
+        image = np.zeros((*self.covered.shape, 3), np.float32)
+        for data in reversed(self.keys):
+            image[data.covered] = data.gbuffer["albedo"]
+        return image[self.covered]
+
+    @cached_property
     def wide(self) -> tuple["WideData", ...]:
         """The keyframes' datasets on these texels."""
         return tuple(WideData(data.folder, data.description, data.keep_alive, self.covered) for data in self.keys)
@@ -165,6 +173,7 @@ def open_animation(animation: Animation, config: Config, folder: str | Path) -> 
             raise UserError(f"{folder / name}: got no dataset, expected a pose; run `ddprt bake` with the same --out first")
     sets = [open_dataset(folder / name) for name in names]
     scenes = [animation.key(index) for index in range(animation.keys)] + [animation.pose(time) for time in times]
+    riders = _riders(animation, config)
     for data, scene in zip(sets, scenes, strict=True):
         digest = _forced(scene, config).digest
         if data.description["scene"]["digest"] != digest or data.resolution != config.atlas.resolution:
@@ -172,7 +181,11 @@ def open_animation(animation: Animation, config: Config, folder: str | Path) -> 
                 f"{data.folder}: got a dataset of another pose or atlas, expected those of the configuration; bake again into "
                 "another --out"
             )
-    riders = _riders(animation, config)
+        if (data.samples.rest is None) != (riders.at(scene.corners).rest is None):
+            raise UserError(
+                f"{data.folder}: got samples of an older version, that change their point from pose to pose, expected those of "
+                "the first pose; bake again into another --out"
+            )
     return AnimatedData(
         animation, riders, tuple(sets[: animation.keys]), tuple(zip(times, sets[animation.keys :], strict=True)), folder
     )

@@ -304,8 +304,7 @@ class _Bake:
         """Points, occluders and the G-buffer, unless they are there."""
         if not manifest.holds("points.safetensors"):
             spans = {"spacing": np.array([samples.spacing]), "depth": np.array([samples.depth])}
-            tensors = {"position": samples.position, "normal": samples.normal, "albedo": samples.albedo}
-            write_tensors(self.folder / "points.safetensors", {**tensors, **spans})
+            write_tensors(self.folder / "points.safetensors", {**samples.tensors, **spans})
             manifest.add("points.safetensors")
         if not manifest.holds("scene.safetensors"):
             write_tensors(self.folder / "scene.safetensors", store.scene_tensors(self.scene, atlas))

@@ -101,7 +101,7 @@ class Dataset:
         """Where direct light was measured, all supersamples in progressive order."""
         tensors = read_tensors(self.folder / "points.safetensors")
         spacing, depth = float(tensors["spacing"][0]), float(tensors.get("depth", np.zeros(1))[0])
-        return Samples(tensors["position"], tensors["normal"], tensors["albedo"], spacing, depth)
+        return Samples.read(tensors, spacing, depth)
 
     @cached_property
     def occluders(self) -> Float64[np.ndarray, "triangles 3 3"]:

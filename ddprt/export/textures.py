@@ -94,9 +94,7 @@ def export_textures(
     sizes = np.abs(maps.values[: maps.bases]).max((1, 2, 3), initial=0)
     scale = np.where(sizes > 0, sizes, 1).astype(np.float32)
     written: list[Path] = []
-    constant = None
-    if model.constant is not None:
-        (constant,), _ = _stitched(model, [_image(model, model.constant, gutter)], gutter, stitch)
+    constant = None if model.constant is None else glow(model, gutter=gutter, stitch=stitch)
     layers: list[str] = []
     if "exr" in formats:
         layers = list(FORMATS["exr"].write(maps, folder).files)
@@ -191,6 +189,12 @@ def textures(model: Model, *, precision: str = "half", gutter: int = 4, stitch: 
     images, seams = _stitched(model, images, gutter, stitch)
     empty = np.zeros((0, *model.covered.shape, 1 if model.encoding.channels == "mono" else 3), np.float32)
     return Maps(np.stack(images) if images else empty, len(bases), _known(model, gutter), precision), seams
+
+
+def glow(model: Model, *, gutter: int, stitch: bool) -> np.ndarray:
+    """The light of what glows as an image, W/m², as `export_textures` writes it."""
+    assert model.constant is not None
+    return _stitched(model, [_image(model, model.constant, gutter)], gutter, stitch)[0][0]
 
 
 def _image(model: Model, entries: np.ndarray, gutter: int) -> np.ndarray:

@@ -123,7 +123,7 @@ def table(scores: Mapping[str, Any]) -> str:
 
 
 def picture(
-    model: AnimatedModel, pose: Pose, lighting: int, height: int = _TALL
+    model: AnimatedModel, pose: Pose, lighting: int, height: int = _TALL, *, lamps: bool = True
 ) -> dict[str, Float64[np.ndarray, "height width rgba"]]:
     """A pose under one held-out lighting as a camera sees it: reference, relit, and the difference times 4.
 
@@ -132,13 +132,14 @@ def picture(
       pose: which.
       lighting: position in the split "test".
       height: pixels.
+      lamps: show the light that comes straight from them too; without, what was learned alone.
     """
     data = pose.data
     light, truth = maps(at_pose(model, "each", pose), data)
     albedo, index = data.gbuffer["albedo"], data.split("test")[lighting]
     camera = default_camera(pose.scene)
     view = take_view(Tracer.of(pose.scene), data.uv, data.covered, camera, height)  # type: ignore[arg-type]
-    direct = data.shaded([index])[0]
+    direct = lamps * data.shaded([index])[0]
     exposure = exposure_for(albedo * (direct + truth.reference[lighting]))
     shots = {
         name: tonemap(view.render(albedo * (direct + part)), exposure)

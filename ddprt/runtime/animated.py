@@ -12,13 +12,12 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ddprt.axes import Float, Float32, Float64, Int
-from ddprt.errors import UserError
+from ddprt.axes import Float32, Float64, Int
 from ddprt.lights import Light, Lighting
 from ddprt.methods.svd_ridge import LinearTransfer
 from ddprt.runtime.model import Model
 from ddprt.sampling.riding import Riders
-from ddprt.scene.poses import check_time
+from ddprt.scene.poses import check_pose, check_time
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,24 +55,23 @@ class AnimatedModel:
         own = sum(array.nbytes for array in (self.matrix, self.offset, self.intercept))
         return int(shared.basis.nbytes + shared.mean.nbytes + own)  # type: ignore[attr-defined]
 
-    def at(self, time: float, positions: Float[np.ndarray, "vertices 3"] | None = None) -> Model:
+    def at(self, time: Any, positions: Any = None) -> Model:
         """The model of a moment.
 
         Args:
           time: from the first keyframe to the last, seconds.
-          positions: of the vertices then, metres, as whoever animates them has them; None goes straight from key to key.
+          positions: of the vertices then, (vertices, 3), metres, as whoever animates them has them; None goes straight from
+            key to key.
         Raises:
-          UserError: a time outside of the keyframes, or another number of vertices.
+          UserError: a time outside of the keyframes, or a pose that is none; see `check_pose`.
         """
-        check_time(self.times, time)
+        time = check_time(self.times, time)
         k, share = self._place(time)
+        name, do = "positions", "mend the pose"
         if positions is None:
             positions = _mixed(self.positions, k, share)
-        elif positions.shape != self.positions.shape[1:] or not np.isfinite(positions).all():
-            raise UserError(
-                f"positions: got shape {positions.shape}, expected finite {self.positions.shape[1:]}, a row for each vertex"
-            )
-        corners = np.asarray(positions, np.float64)[self.triangles]
+            name, do = f"the pose straight between keyframes at {time:g} s", "pass positions, or take more keyframes"
+        corners = check_pose(positions, self.triangles, self.positions.shape[1], name, do)[self.triangles]
         own = (0, 0.0) if len(self.matrix) == 1 else (k, share)
         relighter = self.rest.relighter
         assert isinstance(relighter, LinearTransfer)
@@ -93,8 +91,8 @@ class AnimatedModel:
         self,
         lighting: Lighting | Light | Sequence[dict[str, Any]] | dict[str, Any],
         *,
-        time: float,
-        positions: Float[np.ndarray, "vertices 3"] | None = None,
+        time: Any,
+        positions: Any = None,
     ) -> Float32[np.ndarray, "height width 3"]:
         """Indirect lightmap of a lighting at a time; see `Model.relight` and `at`."""
         return self.at(time, positions).relight(lighting)

@@ -13,13 +13,14 @@ from ddprt.errors import UserError
 from ddprt.files import read_tensors, sha256, write_tensors, write_text
 from ddprt.methods.svd_ridge import LinearTransfer
 from ddprt.runtime.animated import AnimatedModel
-from ddprt.runtime.model_file import load_model
+from ddprt.runtime.model_file import ANIMATION as DOCUMENT
+from ddprt.runtime.model_file import read_model
 from ddprt.sampling.riding import Riders
 
-SCHEMA = 1
-DOCUMENT, TENSORS = "animation.json", "animation.safetensors"
+SCHEMA = 2  # 1: every pose gave samples to points anew
+TENSORS = "animation.safetensors"
 _OWN = ("times", "positions", "triangles", "matrix", "offset", "intercept", "area")
-_RIDERS = ("triangle", "weights", "albedo")
+_RIDERS = ("triangle", "weights")
 
 
 def save_animated(model: AnimatedModel, folder: Path) -> None:
@@ -28,8 +29,7 @@ def save_animated(model: AnimatedModel, folder: Path) -> None:
     Raises:
       UserError: the folder cannot be written.
     """
-    (folder / DOCUMENT).unlink(missing_ok=True)  # of another model, until this one is whole
-    model.rest.save(folder)
+    model.rest.save(folder)  # which takes the document of another away, until this one is whole
     tensors = {name: getattr(model, name) for name in _OWN}
     tensors |= {f"riders.{name}": getattr(model.riders, name) for name in _RIDERS}
     if model.constant is not None:
@@ -37,7 +37,6 @@ def save_animated(model: AnimatedModel, folder: Path) -> None:
     write_tensors(folder / TENSORS, tensors)
     document = {
         "schema": SCHEMA,
-        "spacing": model.riders.spacing,
         "statuses": list(model.statuses),
         "tensors_sha256": sha256(folder / TENSORS),
         "model_sha256": sha256(folder / "tensors.safetensors"),
@@ -59,7 +58,7 @@ def load_animated(folder: str | Path) -> AnimatedModel:
     folder = Path(folder)
     if not is_animated(folder):
         raise UserError(f"{folder}: got no {DOCUMENT}, expected a model of an animation; load others with ddprt.load_model")
-    rest = load_model(folder)
+    rest = read_model(folder)
     try:
         document: dict[str, Any] = json.loads((folder / DOCUMENT).read_text("utf-8"))
         if document["schema"] != SCHEMA:
@@ -68,8 +67,7 @@ def load_animated(folder: str | Path) -> AnimatedModel:
             if document[key] != sha256(folder / name):
                 raise ValueError(f"{name} is not what was saved with it: its checksum is another")
         tensors = read_tensors(folder / TENSORS)
-        own = {name: tensors[f"riders.{name}"] for name in _RIDERS}
-        riders = Riders(**own, spacing=float(document["spacing"]))
+        riders = Riders(**{name: tensors[f"riders.{name}"] for name in _RIDERS}, rest=rest.samples)
         parts: dict[str, Any] = {name: tensors[name] for name in _OWN}
         parts |= {"constant": tensors.get("constant"), "statuses": tuple(document["statuses"])}
         model = AnimatedModel(rest, riders=riders, **parts)

@@ -28,6 +28,8 @@ from ddprt.scene.fog import Fog
 from ddprt.scene.holes import Holes
 
 SCHEMA = 1
+ANIMATION = "animation.json"
+"""What a folder has besides if its model moves, see `animated_file`."""
 _PLACES = ("position", "weight", "texel")  # tensors of a layer
 
 
@@ -81,9 +83,7 @@ def save_model(model: Model, folder: Path) -> None:
       UserError: the folder cannot be written.
     """
     tensors: dict[str, np.ndarray] = {
-        "points.position": model.samples.position,
-        "points.normal": model.samples.normal,
-        "points.albedo": model.samples.albedo,
+        **{f"points.{name}": array for name, array in model.samples.tensors.items()},
         "atlas.covered": model.covered,
         "atlas.area": model.area,
         "scene.corners": model.occluders,
@@ -142,6 +142,7 @@ def save_model(model: Model, folder: Path) -> None:
         "unit": "W/m2",
         "tensors_sha256": sha256(folder / "tensors.safetensors"),
     }
+    (folder / ANIMATION).unlink(missing_ok=True)  # of what moved before in this folder
     write_text(folder / "model.json", json.dumps(document, indent=1) + "\n")
 
 
@@ -149,9 +150,18 @@ def load_model(folder: str | Path) -> Model:
     """Reads a model; neither its dataset nor its scene file is needed.
 
     Raises:
-      UserError: missing, damaged, of another schema, or of a method that is not installed.
+      UserError: missing, damaged, of another schema, of a method that is not installed, or of an animation.
     """
-    folder = Path(folder)
+    if (Path(folder) / ANIMATION).is_file():
+        raise UserError(
+            f"{folder}: got a model of an animation, expected one that stands still; load it with ddprt.load_animated, whose "
+            "at(time) is a model of a moment"
+        )
+    return read_model(Path(folder))
+
+
+def read_model(folder: Path) -> Model:
+    """Reads a model, though it may be but the first pose of an animation; see `load_model`."""
     try:
         document = json.loads((folder / "model.json").read_text("utf-8"))
         schema = document["schema"]
@@ -232,8 +242,8 @@ def _assemble(
     paint = tensors.get("atlas.albedo")
     if paint is not None and paint.shape != (int(tensors["atlas.covered"].sum()), 3):
         raise ValueError(f"got albedo of shape {paint.shape}")
-    position, normal, albedo = (tensors[f"points.{name}"] for name in ("position", "normal", "albedo"))
-    samples = Samples(position, normal, albedo, places.spacing, places.depth)
+    of_points = {name.removeprefix("points."): array for name, array in tensors.items() if name.startswith("points.")}
+    samples = Samples.read(of_points, places.spacing, places.depth)
     return Model(
         document["method"],
         relighter_type(**arguments),

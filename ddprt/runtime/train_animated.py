@@ -91,6 +91,7 @@ def fit_animation(data: AnimatedData, config: Config) -> dict[str, AnimatedModel
             holes=first.holes,
             constant=constants[0],
             exitant=_any_exitant(data),
+            albedo=data.albedo,
         )
         return AnimatedModel(
             rest,

@@ -8,6 +8,7 @@ evenly spread, so that a fit may use fewer points than were baked.
 import hashlib
 import heapq
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,6 +38,7 @@ class Samples:
       albedo: linear.
       spacing: metres; typical distance between neighbours, to weigh position against orientation.
       depth: metres behind the surface that light is evaluated at, see `transport.measure`; 0 on it.
+      rest: the same samples in the pose that points share them out in; None where that is this one.
     """
 
     position: Float64[np.ndarray, "samples 3"]
@@ -44,12 +46,27 @@ class Samples:
     albedo: Float64[np.ndarray, "samples 3"]
     spacing: float
     depth: float = 0.0
+    rest: "Samples | None" = None
+
+    @property
+    def tensors(self) -> dict[str, np.ndarray]:
+        """All places by name, as `read` takes them."""
+        rest = {} if self.rest is None else {"rest.position": self.rest.position, "rest.normal": self.rest.normal}
+        return {"position": self.position, "normal": self.normal, "albedo": self.albedo, **rest}
+
+    @classmethod
+    def read(cls, tensors: Mapping[str, np.ndarray], spacing: float, depth: float = 0.0) -> "Samples":
+        """Of what `tensors` gave."""
+        albedo, rest = tensors["albedo"], None
+        if "rest.position" in tensors:
+            rest = cls(tensors["rest.position"], tensors["rest.normal"], albedo, spacing)
+        return cls(tensors["position"], tensors["normal"], albedo, spacing, depth, rest)
 
     @property
     def digest(self) -> str:
         """Hash of all places: equal digests measure equal light."""
         state = hashlib.sha256()
-        for array in (self.position, self.normal, self.albedo):
+        for array in self.tensors.values():
             state.update(np.ascontiguousarray(array).tobytes())
         if self.depth:
             state.update(np.float64(self.depth).tobytes())
@@ -58,8 +75,11 @@ class Samples:
     def nearest_point(self, points: int) -> Int[np.ndarray, " samples"]:
         """The point (one of the first `points` samples) that each sample is averaged into.
 
-        A quarter turn of the normal counts as one spacing between points, so that a wall's two sides stay apart.
+        A quarter turn of the normal counts as one spacing between points, so that a wall's two sides stay apart. Whatever
+        moves, a sample stays with the point that it has at rest: matrices are mixed between poses, and values must not jump.
         """
+        if self.rest is not None:
+            return self.rest.nearest_point(points)
         spread = self.spacing * np.sqrt(len(self.position) / points)
         places = np.concatenate([self.position / spread, self.normal / np.sqrt(2)], 1)
         home = cKDTree(places[:points]).query(places)[1]

@@ -6,11 +6,13 @@ measurement points do (`ddprt.sampling.riding`). Every pose is a `Scene` like an
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from numbers import Integral, Real
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ddprt.axes import Float, Float64
+from ddprt.axes import Float64, Int
 from ddprt.config import Config
 from ddprt.errors import UserError
 from ddprt.scene.checks import FARTHEST, negligible, vertex_normals
@@ -21,6 +23,7 @@ from ddprt.scene.mesh import Scene
 from ddprt.scene.motions import MOTIONS
 from ddprt.scene.winding import welded
 
+MOST_KEYS = 256
 _TORN = 1e-5  # of the radius: files round positions of one vertex alike
 
 
@@ -73,59 +76,78 @@ class Animation:
         return [first + share * (last - first) for first, last in pairs for share in fractions]
 
 
-def check_time(times: Float64[np.ndarray, " keys"], time: float) -> None:
-    """Refuses a time outside of some keyframes.
+def check_time(times: Float64[np.ndarray, " keys"], time: Any) -> float:
+    """A time in seconds that lies within some keyframes.
 
     Raises:
-      UserError: it is.
+      UserError: it is none, or lies outside of them.
     """
-    if not times[0] <= time <= times[-1]:
+    given = isinstance(time, Real) and not isinstance(time, bool)
+    if not given or not times[0] <= time <= times[-1]:
+        got = f"{float(time):g} s" if given else _shown(time)
         raise UserError(
-            f"time: got {time:g} s, expected {times[0]:g} to {times[-1]:g}, as the keyframes do; choose one within these"
+            f"time: got {got}, expected {times[0]:g} to {times[-1]:g}, as the keyframes do; give seconds within these"
         )
+    return float(time)
 
 
-def posed(rest: Scene, positions: Float[np.ndarray, "vertices 3"], name: str) -> Scene:
+def check_pose(
+    positions: Any,
+    triangles: Int[np.ndarray, "triangles 3"],
+    vertices: int,
+    name: str,
+    do: str = "mend the pose, or take them out of the mesh",
+) -> Float64[np.ndarray, "vertices 3"]:
+    """Vertices of a mesh in another pose.
+
+    Args:
+      positions: what was given for them, metres.
+      triangles, vertices: of the mesh.
+      name: of the pose, for messages.
+      do: about triangles that have lost their area.
+    Raises:
+      UserError: no numbers, another number of vertices, one that is not finite or too far away, or triangles without area.
+    """
+    try:
+        found = np.asarray(positions, np.float64)
+    except (TypeError, ValueError):
+        raise UserError(f"{name}: got {_shown(positions)}, expected an array of numbers, metres; pass vertices") from None
+    if found.shape != (vertices, 3):
+        raise UserError(
+            f"{name}: got shape {found.shape}, expected {(vertices, 3)}, a row for each vertex as in the first pose; keep them"
+        )
+    if not (np.abs(found) < FARTHEST).all():
+        odd = int(np.flatnonzero(~(np.abs(found) < FARTHEST).all(1))[0])
+        raise UserError(
+            f"{name}: got vertex {odd} at {found[odd].tolist()}, expected finite metres, nearer than {FARTHEST:g}; mend it"
+        )
+    if flat := int(np.count_nonzero(negligible(found[triangles]))):
+        raise UserError(f"{name}: got {flat} triangles without area that have some in the first pose, expected none; {do}")
+    return found
+
+
+def posed(rest: Scene, positions: Any, name: str) -> Scene:
     """A scene whose vertices have moved; shading normals turn as the faces about their vertex do.
 
     Args:
       rest: the pose that the lightmap is unwrapped on.
-      positions: of its vertices, metres.
+      positions: of its vertices, (vertices, 3), metres.
       name: of the pose, for messages.
     Raises:
-      UserError: another number of vertices, one that is not finite or too far away, or triangles that have lost their area.
+      UserError: see `check_pose`.
     """
-    if positions.shape != rest.positions.shape:
-        raise UserError(
-            f'{name} of "{rest.name}": got {len(positions)} vertices, expected {len(rest.positions)} as the first pose has; '
-            "keep the topology"
-        )
-    if not (np.abs(positions) < FARTHEST).all():
-        raise UserError(
-            f'{name} of "{rest.name}": got a vertex that is not finite or past {FARTHEST:g} m, expected metres; mend the clip'
-        )
-    if flat := int(np.count_nonzero(negligible(positions[rest.triangles]))):
-        raise UserError(
-            f'{name} of "{rest.name}": got {flat} triangles without area that have some in the first pose, expected none; '
-            "mend the pose, or take them out of the mesh"
-        )
-    if np.array_equal(positions, rest.positions):
+    moved = check_pose(positions, rest.triangles, len(rest.positions), f'{name} of "{rest.name}"')
+    if np.array_equal(moved, rest.positions):
         return replace(rest, rest=rest)
-    before, after = vertex_normals(rest.positions, rest.triangles), vertex_normals(positions, rest.triangles)
-    return replace(rest, positions=positions, normals=_turned(rest.normals, before, after), rest=rest)
+    before, after = vertex_normals(rest.positions, rest.triangles), vertex_normals(moved, rest.triangles)
+    return replace(rest, positions=moved, normals=_turned(rest.normals, before, after), rest=rest)
 
 
-def load_animation(
-    source: str | Path | Sequence[str | Path],
-    *,
-    keys: int | Sequence[float] = 0,
-    clip: str = "",
-    **parameters: float | int,
-) -> Animation:
+def load_animation(source: Any, *, keys: Any = 0, clip: Any = "", **parameters: Any) -> Animation:
     """A moving scene by name, from the clip of a glTF file, or from files that hold a pose each.
 
     Args:
-      source: a key of `MOTIONS`, a path that ends in .glb or .gltf, or a list of mesh files of one topology.
+      source: a key of `MOTIONS`, a path that ends in .glb or .gltf, or a list of mesh files of one topology, a second apart.
       keys: how many keyframes, evenly over the motion, or their times in seconds; 0 takes 3, or every file of a list.
       clip: name or number of the animation in a glTF file; empty takes the first.
       parameters: numbers that a scene of the library takes.
@@ -133,8 +155,13 @@ def load_animation(
       UserError: nothing that moves, files of different topology, times that do not rise or lie outside of the motion, poses
         that are none, or what `load_scene` refuses.
     """
+    if isinstance(clip, bool) or not isinstance(clip, str | Integral):
+        raise UserError(f"animation.clip: got {_shown(clip)}, expected the name or the number of an animation; give one")
+    clip = str(clip)
+    if "fog" in parameters:
+        raise UserError("fog: got fog about an animation, expected clear air; leave it out")
     if not isinstance(source, str | Path):
-        return _of_files(source, keys, clip)
+        return _of_files(source, keys, clip, parameters)
     path = Path(source)
     if path.suffix.lower() in (".glb", ".gltf"):
         if parameters:
@@ -168,29 +195,44 @@ def configured_animation(config: Config) -> Animation:
     return load_animation(source, keys=settings.keys, clip=settings.clip, **parameters)
 
 
-def chosen_times(keys: int | Sequence[float], span: tuple[float, float]) -> Float64[np.ndarray, " keys"]:
+def chosen_times(keys: Any, span: tuple[float, float]) -> Float64[np.ndarray, " keys"]:
     """Times of keyframes.
 
     Args:
       keys: how many, 0 for 3; or the times themselves.
       span: first and last second of the motion.
     Raises:
-      UserError: times that do not rise or lie outside, or several keys of a motion that takes no time.
+      UserError: neither, times that do not rise or lie outside, or several keys of a motion that takes no time.
     """
-    if isinstance(keys, int):
-        count = keys or 3
+    if _is_count(keys):
+        count = int(keys) or 3
         if count > 1 and span[0] == span[1]:
             raise UserError(f"animation.keys: got {count} of a clip that takes no time, expected 1; set it")
         return np.linspace(span[0], span[1], count) if count > 1 else np.array([span[0]], np.float64)
-    times = np.asarray(keys, np.float64)
-    if times.ndim != 1 or not len(times) or (np.diff(times) <= 0).any() or times[0] < span[0] or times[-1] > span[1]:
+    try:
+        times = np.asarray(keys, np.float64)
+        fine = times.ndim == 1 and len(times) > 0 and bool((np.diff(times) > 0).all())
+        fine = fine and bool(times[0] >= span[0] and times[-1] <= span[1])
+    except (TypeError, ValueError):
+        fine = False
+    if not fine:
         raise UserError(
-            f"animation.keys: got {list(keys)}, expected rising seconds from {span[0]:g} to {span[1]:g}; mend the list"
+            f"animation.keys: got {_shown(keys)}, expected rising seconds from {span[0]:g} to {span[1]:g}, or a number of "
+            f"keyframes up to {MOST_KEYS}; mend it"
         )
     return times
 
 
-def _of_clip(path: Path, keys: int | Sequence[float], clip: str) -> Animation:
+def _is_count(keys: Any) -> bool:
+    return isinstance(keys, Integral) and not isinstance(keys, bool) and 0 <= int(keys) <= MOST_KEYS
+
+
+def _shown(value: Any) -> str:
+    """What was given, on a line."""
+    return " ".join(repr(value).split())[:60]
+
+
+def _of_clip(path: Path, keys: Any, clip: str) -> Animation:
     if not path.is_file():
         raise UserError(f"{path}: got no such file, expected a mesh; check the path")
     try:
@@ -206,14 +248,21 @@ def _of_clip(path: Path, keys: int | Sequence[float], clip: str) -> Animation:
         ) from problem
 
 
-def _of_files(sources: Sequence[str | Path], keys: int | Sequence[float], clip: str) -> Animation:
+def _of_files(sources: Any, keys: Any, clip: str, parameters: dict[str, Any]) -> Animation:
+    if not isinstance(sources, Sequence) or not all(isinstance(source, str | Path) for source in sources):
+        raise UserError(
+            f"load_animation: got {_shown(sources)}, expected a name of a scene that moves, a .glb or .gltf, or a list of mesh "
+            "files; name one"
+        )
     if not len(sources):
         raise UserError("scene.poses: got an empty list, expected mesh files of one topology; name at least one")
-    if clip or not (keys == 0 or keys == len(sources)):
+    if clip or not (_is_count(keys) and keys in (0, len(sources))):
         raise UserError(
-            f"scene.poses: got {len(sources)} files beside animation.keys = {keys} and clip = {clip!r}, expected a key for "
-            "each file; leave both out"
+            f"scene.poses: got {len(sources)} files beside animation.keys = {_shown(keys)} and clip = {clip!r}, expected "
+            "neither, since files are keyframes a second apart; leave both out"
         )
+    if parameters:
+        raise UserError(f"scene.poses: got parameter {next(iter(parameters))}, expected none for files; leave it out")
     scenes = [load_scene(source) for source in sources]
     for source, scene in zip(sources, scenes, strict=True):
         same = scene.positions.shape == scenes[0].positions.shape and np.array_equal(scene.triangles, scenes[0].triangles)
