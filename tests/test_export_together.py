@@ -79,12 +79,10 @@ def test_without_layers_there_is_no_shader_and_the_manifest_says_why(kind: str, 
 def test_exports_of_all_kinds_tell_their_fog(kind: str, tmp_path: Path) -> None:
     """Methods that are told lamps too: the engine's direct light on surfaces is attenuated, whatever makes the indirect."""
     model = model_of(relighters(3, 3)[kind])
-    for fog in (None, Fog((1.0, 2.0, 3.0))):
+    for fog, told in ((None, (False, 0)), (Fog((1.0, 2.0, 3.0)), (True, 1))):
         *_, path = export_model(replace(model, fog=fog), tmp_path, stitch=False, gutter=2)
         manifest = json.loads(path.read_text())
-        assert ("fog" in manifest, sum("fog" in step for step in manifest["decode"])) == (
-            (False, 0) if fog is None else (True, 1)
-        )
+        assert ("fog" in manifest, sum("fog" in step for step in manifest["decode"])) == told
 
 
 @pytest.mark.parametrize("kind", ["decoder", "turned decoder", "mean", "nearest"])
