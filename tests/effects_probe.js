@@ -21,27 +21,35 @@ const half = (x) => {
 };
 const composed = () => Array.from(app.frame.composer.read());
 
+const middle = (map) => {
+  const lit = map.filter((x, i) => i % 4 < 3 && x > 0);
+  return Math.log2((0.3 * Math.PI * lit.length) / lit.reduce((sum, x) => sum + x, 0));
+};
+const shot = async (changes, exposure) => {
+  app.set({ ...changes, exposure });
+  return { ...(await pixels()), exposure: app.state.exposure };
+};
+
 async function probe() {
   const { stored } = app.model;
-  app.set({ lighting: null, lamps: asked.lamps, show: "both", source: "ours", albedo: false, exposure: asked.exposure });
+  app.set({ lighting: null, lamps: asked.lamps, show: "both", source: "ours", albedo: false });
   report.measured = Array.from(app.frame.values);
   report.own = composed();
-  report.both = await pixels();
+  app.expose();
+  report.both = await shot({}, app.state.exposure);
   report.fov = app.view.camera.fov;
   report.notes = Array.from(document.querySelectorAll("#notes li"), (line) => line.textContent);
   report.stored = stored.map((_, lighting) => {
     app.set({ lighting });
     return { map: composed(), said: document.getElementById("error-told").textContent, lamps: app.state.lamps.length };
   });
-  app.set({ lighting: 0, source: "reference", show: "indirect" });
   report.truth = Array.from(stored[0].indirect, half);
-  report.reference = await pixels();
-  app.set({ source: "error" });
-  report.error = await pixels();
+  report.reference = await shot({ lighting: 0, source: "reference", show: "indirect" }, middle(report.truth));
+  report.error = await shot({ source: "error" }, 0);
   report.ours = composed();
-  app.set({ lighting: stored.length - 1, source: "ours", show: "direct" });
-  report.laid = Array.from(stored[stored.length - 1].direct, half);
-  report.spread = await pixels();
+  const last = stored.length - 1;
+  report.laid = Array.from(stored[last].direct, half);
+  report.spread = await shot({ lighting: last, source: "ours", show: "direct" }, middle(report.laid));
 }
 
 probe()

@@ -23,8 +23,8 @@ window.addEventListener("error", (event) => window.faults.push(event.message));
 for (const name of ["error", "warn"]) console[name] = (...said) => window.faults.push(said.join(" "));</script>"""
 
 
-def browsed(whole: str, question: dict[str, Any], probe: str, folder: Path) -> dict[str, Any]:
-    """What a probe finds in a page."""
+def browsed(whole: str, question: dict[str, Any], probe: str, folder: Path, *flags: str) -> dict[str, Any]:
+    """What a probe finds in a page, with further flags for the browser."""
     if BROWSER is None:
         pytest.skip("needs chromium or google-chrome on the path")
     text = json.dumps(question).replace("<", "\\u003c")
@@ -33,7 +33,7 @@ def browsed(whole: str, question: dict[str, Any], probe: str, folder: Path) -> d
     at = whole.rindex("</body>")
     made = folder / "page.html"
     made.write_text(whole[:at] + added + whole[at + len("</body>") :], "utf-8")
-    command = [BROWSER, *FLAGS, f"--user-data-dir={folder / 'profile'}", made.as_uri()]
+    command = [BROWSER, *FLAGS, *flags, f"--user-data-dir={folder / 'profile'}", made.as_uri()]
     dumped = subprocess.run(command, capture_output=True, text=True, check=True, timeout=200).stdout
     answer = re.search(r'<p id="probe">(.*?)</p>', dumped)
     assert answer, "the page did not come to an end"
