@@ -270,6 +270,7 @@ def asked(model: Model, data: Dataset, statue: Scene, tmp_path_factory: pytest.T
 def test_page_has_no_faults(asked: Asked) -> None:
     assert asked.found["faults"] == []
     assert asked.found["wide"] == 0, "nothing sticks out"
+    assert asked.found["panel"] > 200
 
 
 @pytest.mark.slow

@@ -71,10 +71,10 @@ def test_fingers_turn_zoom_pick_and_drag(packed: dict[str, Any], tmp_path: Path)
         turned = eye()
         assert np.linalg.norm(turned - first) > 0.1 * away(first)
         assert away(turned) == pytest.approx(away(first), rel=1e-6)
-        rests = place(1)
-        drawn(*[[(rests[0] - 60 - 10 * i, rests[1]), rests] for i in range(8)])
+        drawn(*[[(200 - 10 * i, 450), (260 + 10 * i, 450)] for i in range(8)])
         assert away(eye()) < 0.8 * away(turned)
-        assert hand.value("ddprt.state.chosen") == 0, "a pinch picks no lamp, though one finger rests on it"
+        drawn([(100, 450), place(1)])
+        assert hand.value("ddprt.state.chosen") == 0, "two fingers pick no lamp, though one is on it"
 
         hand.value("ddprt.reset()")
         settled()
@@ -87,4 +87,5 @@ def test_fingers_turn_zoom_pick_and_drag(packed: dict[str, Any], tmp_path: Path)
         np.testing.assert_allclose(lamp[1:], lights[1]["position"][1:], atol=1e-6)
         np.testing.assert_allclose(eye(), first, atol=1e-6)
         drawn(*[[(100 + 10 * i, 450)] for i in range(8)])
+        assert hand.value("document.getElementById('panel').getClientRects().length") == 1
         assert np.linalg.norm(eye() - first) > 0.1 * away(first), "and after that fingers turn again"

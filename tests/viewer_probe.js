@@ -92,6 +92,7 @@ async function probe() {
   report.fov = app.view.camera.fov;
   app.set({ lamps: [] });
   report.dark = (await pixels()).data.reduce((most, x, i) => Math.max(most, i % 4 === 3 ? 0 : x), 0);
+  report.panel = document.getElementById("panel").getBoundingClientRect().width;
   report.wide = document.documentElement.scrollWidth - document.documentElement.clientWidth;
 }
 
