@@ -12,7 +12,7 @@ from ddprt.scene.mesh import Scene
 from ddprt.transport.hairiness import hairy
 from ddprt.transport.translucency import filled
 
-BESIDE = ("gloss", "emission", "subsurface", "hair", "probes")
+BESIDE = ("gloss", "emission", "subsurface", "hair")
 """Effects that nothing simulates yet in a scene with fog."""
 
 _MANY = 50.0  # meetings of a path with fog from wall to wall
@@ -49,6 +49,11 @@ def long_in_fog(scene: Scene, bounces: int) -> str | None:
     )
 
 
+def hazy(scene: Scene) -> bool:
+    """Whether there is fog that scatters light."""
+    return scene.fog is not None and any(scene.fog.albedo) and foggy(scene)
+
+
 def refuse_beside_fog(called: Callable[[str], bool]) -> None:
     """Makes sure that a plan with fog has nothing that knows no fog.
 
@@ -59,10 +64,9 @@ def refuse_beside_fog(called: Callable[[str], bool]) -> None:
     """
     found = [name for name in BESIDE if called(name)] if called("fog") else []
     if found:
-        remedy = "ask for no probes" if found == ["probes"] else f'set effects.off = ["{found[0]}"] or ["fog"]'
         raise UserError(
             f"effects: got fog beside {' and '.join(found)}, which is not simulated yet, expected one without the other; "
-            f"{remedy}"
+            f'set effects.off = ["{found[0]}"] or ["fog"]'
         )
 
 
