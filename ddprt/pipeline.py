@@ -63,6 +63,10 @@ class Run:
 
         check_names(self.config)
         self._check_views()
+        if self.config.export.gltf_preview:
+            from ddprt.export.gltf.writing import preview_lighting
+
+            preview_lighting(self.config.export.gltf_preview)
         if self.config.export.formats != ("exr",):
             from ddprt.export.formats.listing import check_formats
 
@@ -248,11 +252,15 @@ class Run:
     def export(self, model: Any) -> list[Path]:
         """Writes what engines load."""
         from ddprt.export.deployed import export_model
+        from ddprt.export.gltf.writing import write_gltf
         from ddprt.export.layers import export_layers
 
+        settings = self.config.export
         with self.progress.stage("export"):
-            files = export_model(model, self.folder / "export", **self.config.export.model_dump())
+            files = export_model(model, self.folder / "export", **settings.model_dump(exclude={"gltf", "gltf_preview"}))
             export_layers(model, self.folder / "export")
+            imported = self.config.scene.name == IMPORTED
+            write_gltf(model, self.folder / "export", settings, lambda: None if imported else self.scene)
         seams = json.loads(files[-1].read_text())["seams"]
         if self.config.export.stitch and not seams["stitched"]:
             self.progress.warn(f"export.stitch: seams stay open: {seams['why']}")

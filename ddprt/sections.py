@@ -301,6 +301,10 @@ class ExportConfig(Section):
     engines: tuple[Literal["unity", "unreal", "godot", "three", "c"], ...] = Field(
         (), description="engines that get a folder with shader, loader and notes (docs/engines.md); brings the format raw"
     )
+    gltf: bool = Field(
+        False, description="write scene.glb, whose second texture coordinates are the lightmap's (docs/engines.md)"
+    )
+    gltf_preview: str = Field("", description="file of lightings, whose first is shown in scene.glb by MOZ_lightmap")
 
     @field_validator("formats", "engines")
     @classmethod
@@ -309,6 +313,14 @@ class ExportConfig(Section):
         if twice:
             raise ValueError(f'got "{twice}" more than once, expected every one once; leave the others out')
         return names
+
+    @model_validator(mode="after")
+    def _shown_somewhere(self) -> "ExportConfig":
+        if self.gltf_preview and not self.gltf:
+            raise ValueError(
+                f'gltf_preview: got "{self.gltf_preview}" with gltf = false, expected true; set export.gltf = true'
+            )
+        return self
 
 
 class BenchConfig(Section):

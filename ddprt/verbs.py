@@ -154,6 +154,8 @@ def export(call: Call) -> None:
     if call.asks("engines"):
         names = [name.strip() for name in call.options["engines"].split(",")]
         call.overrides["export.engines"] = json.dumps(list(ENGINES) if names == ["all"] else names)
+    if call.asks("gltf"):
+        call.overrides["export.gltf"] = "true"
     job = call.run()
     folder = job.folder / "model.ddprt"
     model = load_animated(folder) if is_animated(folder) else load_model(folder)
@@ -241,7 +243,10 @@ VERBS = {
     "export": Verb(
         export,
         options=_OUT | {"engines": "NAMES  folders of engines: unity, unreal, godot, three, c, or all (docs/engines.md)"},
-        flags={"table": "   error against bytes of every format of textures (docs/export.md)"},
+        flags={
+            "table": "   error against bytes of every format of textures (docs/export.md)",
+            "gltf": "   the scene as scene.glb, with the lightmap's coordinates (docs/engines.md)",
+        },
     ),
     "view": Verb(
         view,

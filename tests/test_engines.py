@@ -6,6 +6,7 @@ import struct
 import subprocess
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from ddprt.export.engines.listing import ENGINES
 from ddprt.export.engines.packed import Packed
 from ddprt.export.golden import example_values
 from ddprt.runtime.model import Model
+from ddprt.sampling.points import Samples
 from ddprt.sections import ExportConfig
 
 COMPILER = shutil.which("gcc") or shutil.which("clang")
@@ -43,6 +45,15 @@ CASES: dict[str, tuple[str, str, str, dict[str, Any]]] = {
 }
 
 
+def crowded(samples: Samples) -> Samples:
+    """With two more near the fourth point and one near the sixth."""
+    extra = [3, 3, 5]
+    parts = {
+        name: np.concatenate([rows, rows[extra] + 1e-3]) for name in ("position", "normal") for rows in [getattr(samples, name)]
+    }
+    return replace(samples, albedo=np.concatenate([samples.albedo, [[0.1] * 3, [0.9] * 3, [0.3] * 3]]), **parts)
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[Model, Path]]:
     """A model and its export for all engines, made once."""
@@ -52,6 +63,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[Mode
         if case not in kept:
             kind, channels, space, more = CASES[case]
             model = model_of(relighters(3, 3 if channels == "mono" else 1)[kind], channels, space, **more)
+            model = replace(model, samples=crowded(model.samples))
             folder = tmp_path_factory.mktemp("engines")
             export_model(model, folder, precision="float", engines=list(ENGINES), stitch=False, gutter=2)
             kept[case] = model, folder

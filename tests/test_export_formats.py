@@ -374,7 +374,7 @@ def test_refit_false_keeps_the_old_coefficients(plain: Model, tmp_path: Path) ->
 BAD: dict[str, tuple[Any, str]] = {
     "unknown": (["exr", "bc7"], r"formats.*bc7"),
     "none": ([], r"formats: got \[\], expected at least 1 entry"),
-    "twice": (["raw", "raw"], r'formats: got "raw" more than once, expected every format once'),
+    "twice": (["raw", "raw"], r'formats: got "raw" more than once, expected every one once'),
     "no list": ("raw", r"formats: got 'raw', expected a list"),
 }
 

@@ -48,6 +48,10 @@ def check_settings(settings: Mapping[str, Any]) -> None:
             f'export.engines: got "{settings["engines"][0]}" with an animation, expected none: loaders know one transfer; '
             "set export.engines = []"
         )
+    if settings.get("gltf"):
+        raise UserError(
+            "export.gltf: got true with an animation, expected false: the file would stand still; set export.gltf = false"
+        )
 
 
 def export_animated(model: AnimatedModel, folder: str | Path, **settings: Any) -> list[Path]:
@@ -64,7 +68,7 @@ def export_animated(model: AnimatedModel, folder: str | Path, **settings: Any) -
     """
     check_settings(settings)
     folder = Path(folder)
-    settings = {name: value for name, value in settings.items() if name != "engines"}
+    settings = {name: value for name, value in settings.items() if name not in ("engines", "gltf", "gltf_preview")}
     *files, path = export_textures(model.rest, folder, **settings)
     manifest = json.loads(path.read_text("utf-8"))
     scale = np.asarray(manifest["basis_scale"], np.float32)

@@ -66,10 +66,16 @@ function run() {
     bind(1, gl.TEXTURE_2D, "constant", gl.getExtension("OES_texture_float_linear") ? gl.LINEAR : gl.NEAREST);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, width, height, 0, gl.RGBA, gl.FLOAT, new Float32Array(bytes(given.constant)));
   }
-  gl.bindBufferBase(gl.UNIFORM_BUFFER, 0, gl.createBuffer());
-  gl.bufferData(gl.UNIFORM_BUFFER, new Float32Array(bytes(given.rows)), gl.DYNAMIC_DRAW);
-  gl.uniformBlockBinding(program, gl.getUniformBlockIndex(program, "Frame"), 0);
-  gl.activeTexture(gl.TEXTURE2);
+  const rows = new Float32Array(bytes(given.rows));
+  if (gl.getUniformLocation(program, "rows")) {
+    bind(2, gl.TEXTURE_2D, "rows", gl.NEAREST);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, rows.length / 4, 1, 0, gl.RGBA, gl.FLOAT, rows);
+  } else {
+    gl.bindBufferBase(gl.UNIFORM_BUFFER, 0, gl.createBuffer());
+    gl.bufferData(gl.UNIFORM_BUFFER, rows, gl.DYNAMIC_DRAW);
+    gl.uniformBlockBinding(program, gl.getUniformBlockIndex(program, "Frame"), 0);
+  }
+  gl.activeTexture(gl.TEXTURE3);
   const target = gl.createTexture(), [down, across] = given.size;
   gl.bindTexture(gl.TEXTURE_2D, target);
   gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32F, across, down);
@@ -135,22 +141,48 @@ def shaded(
     Raises:
       UserError: no browser, no shader, or the browser could not run it; with its words.
     """
-    found = browser()
-    if found is None:
-        raise UserError(f"shader: got no browser on the path, expected one of {', '.join(BROWSERS)}; install one")
     source = folder / "decode.glsl"
     if not source.is_file():
         raise UserError(f"shader: got {folder} without decode.glsl, expected an export with one; its manifest says why")
     manifest = json.loads((folder / "manifest.json").read_text())
-    layers, half = layer_stack(folder), manifest["precision"] == "half"
+    layers, half, constant = layer_stack(folder), manifest["precision"] == "half", manifest.get("constant")
+    glow = read_exr(folder / constant)[0] if constant else None
+    return drawn(source.read_text(), layers, rows, scratch, half=half, glow=glow, size=size, batches=batches, draws=draws)
+
+
+def drawn(
+    source: str,
+    layers: Float32[np.ndarray, "layers height width 4"],
+    rows: Float32[np.ndarray, "rows 4"],
+    scratch: Path,
+    *,
+    half: bool = True,
+    glow: Float32[np.ndarray, "height width 3"] | None = None,
+    size: tuple[int, int] | None = None,
+    batches: int = 0,
+    draws: int = 8,
+) -> dict[str, Any]:
+    """The same of any fragment shader that reads `layers`, `constant`, and `rows`: a texture, or the block `Frame`.
+
+    Args:
+      source: GLSL ES 3.00.
+      layers: of the array texture.
+      rows, scratch, size, batches, draws: as for `shaded`.
+      half: whether the textures are halves.
+      glow: what `constant` holds.
+    Raises:
+      UserError: no browser, or it could not run the shader; with its words.
+    """
+    found = browser()
+    if found is None:
+        raise UserError(f"shader: got no browser on the path, expected one of {', '.join(BROWSERS)}; install one")
     height, width = size or layers.shape[1:3]
-    constant = manifest.get("constant")
     given = {
-        "source": source.read_text(),
+        "source": source,
         "shape": layers.shape[:3],
         "half": half,
         "layers": _text(layers.astype(np.float16 if half else np.float32)),
-        "constant": _text(_four(read_exr(folder / constant)[0])) if constant else None,
+        "constant": None if glow is None else _text(_four(glow)),
         "rows": _text(rows),
         "size": (height, width),
         "batches": batches,

@@ -1,4 +1,4 @@
-"""Engines: one binary file that all of them load, a shader that is printed in each one's language, and a loader for each.
+"""Engines: one binary file that all of them load, a shader printed in each one's language, a loader and notes for each.
 
-Enters an export folder with the format "raw"; leaves a folder for each engine. Nothing of the model itself is looked at.
+Enters: an export folder with the format "raw". Leaves: a folder for each engine. The model itself never enters.
 """

@@ -10,7 +10,6 @@ import numpy as np
 
 from ddprt.axes import Bool, Float
 from ddprt.errors import UserError
-from ddprt.export.engines.engine import HERE
 from ddprt.export.engines.listing import ENGINES
 from ddprt.export.engines.packed import Packed
 from ddprt.files import make_folder, write_text, written_whole
@@ -57,11 +56,12 @@ def export_engines(
     document, data = _golden(packed, covered, values), packed.to_bytes()
     written = []
     for name in names:
-        engine, place = ENGINES[name], folder / name
+        place = folder / name
         make_folder(place)
-        texts = {Path(file).name: (HERE / file).read_text("utf-8") for file in engine.files}
-        texts |= {file: print_it(packed) for file, print_it in engine.printed.items()}
-        texts |= {GOLDEN: json.dumps(document, allow_nan=False) + "\n", NUMBERS: _as_text(document)}
+        texts = ENGINES[name].texts(packed) | {
+            GOLDEN: json.dumps(document, allow_nan=False) + "\n",
+            NUMBERS: _as_text(document),
+        }
         for file, text in texts.items():
             write_text(place / file, text)
         with written_whole(place / MODEL) as temporary:

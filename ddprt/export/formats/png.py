@@ -25,8 +25,8 @@ IMPORT = (
 )
 
 
-def write_png(path: Path, image: np.ndarray) -> None:
-    """Writes (height, width, 3 or 4) uint8, row 0 at the top."""
+def png_bytes(image: np.ndarray) -> bytes:
+    """The file of (height, width, 3 or 4) uint8, row 0 at the top."""
     height, width, channels = image.shape
     header = struct.pack(">IIBBBBB", width, height, 8, _KINDS[channels], 0, 0, 0)
     rows = image.reshape(height, width * channels)
@@ -34,8 +34,13 @@ def write_png(path: Path, image: np.ndarray) -> None:
     filtered = np.concatenate([np.full((height, 1), 2, np.uint8), rows - above], 1)  # the Up filter: what a smooth map likes
     parts = [(b"IHDR", header), (b"IDAT", zlib.compress(filtered.tobytes(), 9)), (b"IEND", b"")]
     data = [struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body)) for kind, body in parts]
+    return _MAGIC + b"".join(data)
+
+
+def write_png(path: Path, image: np.ndarray) -> None:
+    """Writes (height, width, 3 or 4) uint8, row 0 at the top."""
     with written_whole(path) as temporary:
-        temporary.write_bytes(_MAGIC + b"".join(data))
+        temporary.write_bytes(png_bytes(image))
 
 
 def read_png(path: Path) -> np.ndarray:
