@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from ddprt.export.textures import export_textures
 from ddprt.files import read_tensors, write_tensors
 from ddprt.lights import Light, Lighting, parse_lighting
 from ddprt.sampling.points import place_samples
+from ddprt.scene.fog import Fog
 from ddprt.scene.material import Material
 from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import faceted, rectangle
@@ -384,13 +386,18 @@ def test_older_datasets_and_models_lie_on_the_surface(data: Dataset, tmp_path: P
     np.testing.assert_allclose(older.measure(data.lightings[1]), one_each / sizes, rtol=2 * sizes.max() * U32)
 
 
-def test_exported_samples_shade_by_the_documented_steps(data: Dataset, tmp_path: Path) -> None:
-    """The block of docs/export.md that says what depth means, against what the model measures."""
-    model = ddprt.fit(data, bases=2)
+@pytest.mark.parametrize("fog", [None, Fog((0.3, 0.5, 2.0), (0.9, 0.8, 0.7), 0.3)], ids=["clear", "fog"])
+def test_exported_samples_shade_by_the_documented_steps(fog: Fog | None, data: Dataset, tmp_path: Path) -> None:
+    """The block of docs/export.md that says what depth and fog mean, against what the model measures."""
+    model = replace(ddprt.fit(data, bases=2), fog=fog)
     export_textures(model, tmp_path)
     manifest = json.loads((tmp_path / "manifest.json").read_text())
     assert manifest["depth"] == model.samples.depth > 0
     assert any("depth" in line for line in manifest["decode"])
+    assert any("fog" in line for line in manifest["decode"]) == ("fog" in manifest) == (fog is not None)
+    if fog is not None:
+        box = {"low": model.occluders.min((0, 1)).tolist(), "high": model.occluders.max((0, 1)).tolist()}
+        assert manifest["fog"] == {**fog.record, **box}
     block = re.search(r"```python\n(def shade.*?)```", DOCS.read_text(), re.DOTALL)
     assert block, "docs/export.md does not say how to shade"
     scope: dict = {"json": json, "np": np, "Path": Path}

@@ -20,6 +20,7 @@ from ddprt.files import read_tensors
 from ddprt.pipeline_animation import AnimatedRun
 from ddprt.runtime.animated import AnimatedModel
 from ddprt.sampling.riding import Riders
+from ddprt.scene.fog import Fog
 
 
 def moving() -> AnimatedModel:
@@ -72,6 +73,16 @@ def test_without_layers_there_is_no_shader_and_the_manifest_says_why(kind: str, 
     assert told["shader"] == {"file": None, "why": 'it reads EXR layers; add "exr" to export.formats'}
     assert told["golden"] is None
     assert {path.name for path in files} == {path.name for path in tmp_path.iterdir()}
+
+
+@pytest.mark.parametrize("kind", ["plain", "cosines", "nearest"])
+def test_exports_of_all_kinds_tell_their_fog(kind: str, tmp_path: Path) -> None:
+    """Methods that are told lamps too: the engine's direct light on surfaces is attenuated, whatever makes the indirect."""
+    model = model_of(relighters(3, 3)[kind])
+    for fog, told in ((None, (False, 0)), (Fog((1.0, 2.0, 3.0)), (True, 1))):
+        *_, path = export_model(replace(model, fog=fog), tmp_path, stitch=False, gutter=2)
+        manifest = json.loads(path.read_text())
+        assert ("fog" in manifest, sum("fog" in step for step in manifest["decode"])) == told
 
 
 @pytest.mark.parametrize("kind", ["decoder", "turned decoder", "mean", "nearest"])

@@ -15,9 +15,12 @@ from scipy.stats import chi2
 import ddprt
 from ddprt import warp
 from ddprt.config import Config, checked
+from ddprt.dataset import generate
+from ddprt.dataset.splits import doubt
 from ddprt.errors import UserError
 from ddprt.files import sha256
 from ddprt.lights import parse_lighting
+from ddprt.progress import Doubt
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.fog import Fog
 from ddprt.scene.library import build
@@ -30,6 +33,7 @@ from ddprt.transport.effects import force, plan
 from ddprt.transport.embree import Tracer, lifted
 from ddprt.transport.fog import Air
 from ddprt.transport.fog_reference import stretch, turned
+from ddprt.transport.fogginess import long_in_fog
 from ddprt.transport.measure import measure
 from ddprt.transport.medium import Medium
 from ddprt.transport.meetings import pdf_henyey, sample_henyey
@@ -394,7 +398,10 @@ def job(**changes: Any) -> Config:
         ({"emission": Emission((1.0, 1.0, 1.0))}, "emission"),
     ],
 )
-def test_what_is_beside_fog_is_refused_before_anything_is_baked(room: Scene, part: Any, name: str, tmp_path: Path) -> None:
+def test_what_is_beside_fog_is_refused_before_anything_is_baked(
+    room: Scene, part: Any, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(generate, "choose_lightings", None)  # and so before lightings are drawn, too
     other = room.made_of(lambda wall: replace(wall, **part) if wall.name == "red" else wall)
     with pytest.raises(UserError, match=f"got fog beside {name}, which is not simulated yet") as caught:
         ddprt.bake(other, config=job(), out=tmp_path / "out")
@@ -402,7 +409,8 @@ def test_what_is_beside_fog_is_refused_before_anything_is_baked(room: Scene, par
     assert not (tmp_path / "out" / "dataset.json").exists()
 
 
-def test_others_are_refused_beside_fog_too(room: Scene) -> None:
+def test_others_are_refused_beside_fog_too(room: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(generate, "choose_lightings", None)
     fog, few = room.fog, {"points": {"on": "hull"}, "lightings": {"distribution": "around"}}
     with pytest.raises(UserError, match='got "operator", which sees through fog'):
         ddprt.bake(room, config=job(transport={"integrator": "operator"}))
@@ -415,6 +423,31 @@ def test_others_are_refused_beside_fog_too(room: Scene) -> None:
     glossy = room.made_of(lambda wall: replace(wall, gloss=Gloss(0.3, 1.0)))
     with pytest.raises(UserError, match="got fog beside gloss"):
         ddprt.irradiance(glossy, LAMP, [[0.28, 0.0, 0.05]], [[0, 1, 0]], samples=2)
+
+
+def test_lamps_that_fog_swallows_are_told_from_lamps_that_face_away(cornell: Scene) -> None:
+    thick = replace(cornell, fog=Fog.of({"mean_free_path": 1e-4}))
+    behind = {"type": "directional", "direction": [0, 0, -1], "irradiance": [1, 1, 1]}  # on the back of the back wall
+    for lamp, scene, why in (
+        (LAMP, thick, "shines, but the fog swallows all of it on the way"),
+        (behind, thick, "faces away or is shadowed"),
+        (behind, cornell, "faces away or is shadowed"),
+    ):
+        assert doubt(parse_lighting(lamp), True, scene, Tracer.of(scene)) == f"lights nothing: it {why}"
+
+
+def test_fog_that_paths_hardly_leave_is_warned_of(room: Scene) -> None:
+    def told(bounces: int = -1, **fog: Any) -> str | None:
+        return long_in_fog(replace(room, fog=Fog.of(fog)), bounces)
+
+    line = told(mean_free_path=0.001)
+    assert line is not None
+    assert line.startswith(f"fog: the scene is up to {2 * room.radius / 0.001:.3g} free paths wide")
+    assert told(mean_free_path=[9, 9, 0.001], albedo=[0, 0, 1]) is not None
+    assert long_in_fog(room, -1) is long_in_fog(replace(room, fog=None), -1) is told(5, mean_free_path=0.001) is None
+    assert told(mean_free_path=0.001, albedo=0.9) is None
+    with pytest.warns(Doubt, match="which takes long"), pytest.raises(UserError, match="light nothing"):
+        ddprt.bake(replace(room, fog=Fog.of({"mean_free_path": 1e-4})), config=job())
 
 
 # --- bakes ---------------------------------------------------------------------------------------------------------------

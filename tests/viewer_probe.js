@@ -66,7 +66,14 @@ async function probe() {
   report.link_same = app.link() === link;
   const state = JSON.stringify(app.state);
   report.bad_links = asked.bad_links.map((hash) => app.restore(hash) || JSON.stringify(app.state) !== state);
-  report.said = document.getElementById("said").textContent;
+  const warning = document.getElementById("warning");
+  const warned = () => [warning.textContent, getComputedStyle(warning).display !== "none"];
+  report.warned = warned();
+  app.restore(`#${JSON.stringify({ lamps: Array(9).fill(app.initial.lamps[0]) })}`);
+  [report.too_many] = warned();
+  app.restore("#{}");
+  report.followed = warned();
+  app.restore(link);
 
   for (const [name, entry] of [["2", "show"], ["b", "source"], ["s", "lamps"], ["]", "exposure"]]) {
     key(name);
@@ -85,6 +92,7 @@ async function probe() {
   report.fov = app.view.camera.fov;
   app.set({ lamps: [] });
   report.dark = (await pixels()).data.reduce((most, x, i) => Math.max(most, i % 4 === 3 ? 0 : x), 0);
+  report.panel = document.getElementById("panel").getBoundingClientRect().width;
   report.wide = document.documentElement.scrollWidth - document.documentElement.clientWidth;
 }
 

@@ -34,8 +34,8 @@ from ddprt.sections import PointsConfig
 from ddprt.transport.direct import Texels
 from ddprt.transport.effects import Plan, plan
 from ddprt.transport.embree import Tracer
-from ddprt.transport.fogginess import refuse_beside_fog
-from ddprt.transport.glossiness import scattering
+from ddprt.transport.fogginess import foggy, long_in_fog, refuse_beside_fog
+from ddprt.transport.glossiness import scattering, valid_integrator
 from ddprt.transport.hairiness import refuse_beside
 from ddprt.transport.measure import measure
 from ddprt.transport.openness import build_open_atlas
@@ -165,8 +165,18 @@ class _Bake:
         if self.config.transport.denoise:
             find_denoiser()
         check_choice(self.config, self.first)
+        if foggy(self.scene):
+            self._judge_fog()
         with alone_in(self.folder):
             return self._alone(given, keep_alive)
+
+    def _judge_fog(self) -> None:
+        """Refuses, before anything is made, what fog cannot be simulated beside; warns of fog that takes long."""
+        asked = self.config.transport
+        refuse_beside_fog(plan(self.scene, (), bounces=asked.bounces, probes=self.config.probes.asked).called)
+        valid_integrator(asked.integrator, self.scene)
+        if (slow := long_in_fog(self.scene, asked.bounces)) is not None:
+            self.progress.warn(slow)
 
     def _alone(self, given: Sequence[Lighting] | Splits | None, keep_alive: Any) -> Dataset:
         there = store.read_description(self.folder) if (self.folder / "dataset.json").exists() else None
@@ -199,7 +209,6 @@ class _Bake:
             lightings = [lighting for _, lighting in entries]
         effects = plan(self.scene, lightings, bounces=self.config.transport.bounces, probes=self.config.probes.asked)
         refuse_beside(effects.called, self.config.transport.denoise)
-        refuse_beside_fog(effects.called)
         description = self._description(entries, effects, drawn, samples)
         bounces = next(effect for effect in effects.effects if effect.name == "diffuse bounces")
         operator = description["transport"]["integrator"] == "operator"  # which tells what it left out, if anything

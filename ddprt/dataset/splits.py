@@ -18,6 +18,7 @@ from ddprt.sampling.points import Samples
 from ddprt.scene.distance import distance_within
 from ddprt.scene.mesh import Scene
 from ddprt.sections import LightingsConfig
+from ddprt.transport.direct import Places, mean_irradiance
 from ddprt.transport.embree import Tracer
 from ddprt.transport.measure import measure
 
@@ -26,6 +27,7 @@ Splits = Mapping[str, Sequence[Lighting]]
 Given = ParamSpec("Given")
 Result = TypeVar("Result")
 
+_LOOKED_AT = 4096  # triangles, at most, that are asked whether a lighting would reach them without fog
 _STRENGTHS = ("intensity", "irradiance", "radiance", "scale")
 
 
@@ -224,9 +226,19 @@ def doubt(lighting: Lighting, lights_nothing: bool, scene: Scene, tracer: Tracer
         return prefix + ("stands on a surface" if touching else "stands inside a solid or behind a wall")
     if not lights_nothing:
         return ""
+    if tracer.medium is not None and _shines_in_clear_air(lighting, tracer):
+        return prefix + "shines, but the fog swallows all of it on the way"
     low, high = scene.bounds
     outside = all_placed and all(((place < low) | (place > high)).any() for place in places)
     return prefix + ("stands outside the scene" if outside else "faces away or is shadowed")
+
+
+def _shines_in_clear_air(lighting: Lighting, tracer: Tracer) -> bool:
+    """Whether some triangle's middle would be lit without fog."""
+    few = np.linspace(0, len(tracer.corners) - 1, min(_LOOKED_AT, len(tracer.corners))).astype(int)
+    places = Places.of(tracer, tracer.corners[few].mean(1), tracer.normals[few])
+    clear = tuple(light.translated(-tracer.centre) for light in lighting)
+    return bool(mean_irradiance(tracer, clear, places, np.random.default_rng(0)).any())
 
 
 def grouped(reasons: Mapping[str, str], most: int) -> str:

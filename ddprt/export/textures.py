@@ -14,6 +14,7 @@ import numpy as np
 
 from ddprt import __version__
 from ddprt.errors import UserError
+from ddprt.export import fog
 from ddprt.export.formats.exr import MEAN
 from ddprt.export.formats.format import Maps
 from ddprt.export.formats.listing import FORMATS, check_formats
@@ -158,13 +159,19 @@ def export_textures(
         "matrix": {"file": "transfer.safetensors", "axes": "rgb, bases, points" if mono else "1, bases, points * rgb"},
         "uv": "lightmap coordinates (TEXCOORD_1), origin top-left, row 0 at the top",
         "unit": "irradiance in W/m2, before albedo",
-        "decode": [*DECODE, *([] if constant is None else [GLOWING]), *([] if model.exitant is None else [LEAVING])],
+        "decode": [
+            *DECODE,
+            *([] if constant is None else [GLOWING]),
+            *([] if model.exitant is None else [LEAVING]),
+            *([] if model.fog is None else [fog.DECODE]),
+        ],
         "trust": trust,
     }
     if constant is not None:
         manifest["constant"] = CONSTANT
     if model.exitant is not None:
         manifest["exitant"] = EXITANT
+    manifest |= fog.told(model)
     if told:
         manifest["formats"] = told
         manifest["decode_formats"] = DECODE_FORMAT

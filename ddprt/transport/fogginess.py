@@ -15,12 +15,38 @@ from ddprt.transport.translucency import filled
 BESIDE = ("gloss", "emission", "subsurface", "hair")
 """Effects that nothing simulates yet in a scene with fog."""
 
+_MANY = 50.0  # meetings of a path with fog from wall to wall
 _FLAT = 1e-6  # of the bounding box's diagonal: a thinner box holds no air
 
 
 def foggy(scene: Scene) -> bool:
     """Whether there is fog, and room for it in the bounding box."""
     return scene.fog is not None and float(np.ptp(scene.bounds, axis=0).min()) > 2 * _FLAT * scene.radius
+
+
+def long_in_fog(scene: Scene, bounces: int) -> str | None:
+    """A line about fog that takes paths very long to get out of; None where it does not, or where there is none.
+
+    Paths from wall to wall are as long as without fog, on average over all ways (Blanco and Fournier, "An invariance property
+    of diffusive random walks", 2003), so they meet fog about as often as free paths fit into the scene, unless that swallows
+    them or their bounces are counted.
+
+    Args:
+      scene: with fog or without.
+      bounces: asked for; -1 follows light until nothing is left.
+    """
+    if scene.fog is None or not foggy(scene):
+        return None
+    across = 2 * scene.radius / min(scene.fog.mean_free_path)
+    white = max(scene.fog.albedo)
+    meetings = min(across, 1 / (1 - white) if white < 1 else np.inf, bounces if bounces >= 0 else np.inf)
+    if meetings <= _MANY:
+        return None
+    return (
+        f"fog: the scene is up to {across:.3g} free paths wide, and paths meet it up to {meetings:.2g} times between walls, "
+        "which takes long (ddprt bake --dry-run tells the seconds); raise scene.fog.mean_free_path, lower its albedo, or "
+        "set transport.bounces"
+    )
 
 
 def hazy(scene: Scene) -> bool:

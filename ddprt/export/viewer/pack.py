@@ -3,6 +3,7 @@
 import base64
 import json
 import tempfile
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from ddprt.transport.embree import Tracer
 
 GUTTER = 4
 DRAWN = (PointLight, SpotLight, DirectionalLight)
-"""Lamps that the browser measures and draws."""
+"""Lamps that the browser measures, draws and casts shadows of."""
 HELD_OUT = 4
 """Lightings that a page holds with their references, at most; 8 bytes a texel each."""
 MOST_LAMPS = 8
@@ -65,7 +66,7 @@ def pack(model: Model, data: Dataset | None = None, *, stitch: bool = True) -> d
         raise UserError(f'view: got a model of method "{model.method}", expected svd-ridge; set fit.method = "svd-ridge"')
     if model.uv is None:
         raise UserError("view: got a model of an older version, without lightmap coordinates; bake and fit again")
-    tracer = Tracer(model.occluders, holes=model.holes)
+    tracer = Tracer(model.occluders, holes=model.holes, fog=model.fog)
     camera = camera_for(model.scene["name"], model.occluders)
     with tempfile.TemporaryDirectory() as folder:
         export_textures(model, folder, gutter=GUTTER, stitch=stitch)
@@ -81,6 +82,7 @@ def pack(model: Model, data: Dataset | None = None, *, stitch: bool = True) -> d
         "uv": Packed("f4", model.uv).entry,
         "albedo": None if model.albedo is None else Packed("u1", _painted(model.albedo, model.covered)).entry,
         "holes": None if model.holes is None else _holes(model),
+        "fog": None if tracer.medium is None else {key: getattr(tracer.medium, key).tolist() for key in ("extinction", "half")},
         "camera": {"eye": list(camera.eye), "target": list(camera.target), "fov": camera.fov_deg, "up": list(camera.up)},
         "lights": lights,
         "stored": stored,
@@ -148,9 +150,10 @@ def _held_out(model: Model, data: Dataset) -> list[dict[str, Any]]:
         raise UserError(f"--dataset: got {data.folder} without held-out lightings, expected some; set lightings.test above 0")
     chosen = [held_out[round(at)] for at in np.linspace(0, len(held_out) - 1, min(HELD_OUT, len(held_out)))]
     values, light = data.values(chosen, model.points, model.quantity), data.maps("indirect", chosen)
+    direct = data.maps("direct", chosen)
     if model.constant is not None:
         light = light + model.constant
-    parts = zip(chosen, values, light, model.predict(values), strict=True)
+    parts = zip(chosen, values, direct, light, model.predict(values), strict=True)
     return [_stored(model, index, data.lightings[index], *maps) for index, *maps in parts]
 
 
@@ -159,27 +162,35 @@ def _stored(
     index: int,
     lighting: Lighting,
     values: Float32[np.ndarray, "points 3"],
+    direct: Float32[np.ndarray, "texels 3"],
     truth: Float32[np.ndarray, "texels 3"],
     ours: Float32[np.ndarray, "texels 3"],
 ) -> dict[str, Any]:
     drawn = [light for light in lighting if isinstance(light, DRAWN)][:MOST_LAMPS]
+    omitted = Counter(light.kind for light in lighting) - Counter(light.kind for light in drawn)
     share = model.area / model.area.sum()
     square = lambda light: float(share @ (light.astype(np.float64) ** 2).sum(1))  # noqa: E731
     whole, largest = square(truth), float(np.abs(truth).max(initial=0))
-    if largest > np.finfo(np.float16).max:
+    half = float(np.finfo(np.float16).max)
+    if largest > half:
         raise UserError(
-            f"--dataset: got {largest:.3g} W/m² in lighting {index}, expected at most {np.finfo(np.float16).max:g}, the end of "
+            f"--dataset: got {largest:.3g} W/m² in lighting {index}, expected at most {half:g}, the end of "
             "half floats; leave --dataset out, or bake with weaker lamps"
         )
     return {
         "index": index,
         "lights": [_record(light) for light in drawn],
-        "omitted": len(lighting) - len(drawn),
+        "omitted": dict(omitted),
+        "direct": _map(model, np.minimum(direct, half)) if omitted else None,  # whiter than white where it is that bright
         "values": Packed("f8", values).entry,
-        "indirect": Packed("f2", _four(fill_gutter(model.image(truth), model.covered, GUTTER))).entry,
+        "indirect": _map(model, truth),
         "error": (square(ours - truth) / whole) ** 0.5 if whole > 0 else 0.0,
         "rms": whole**0.5 or 1.0,
     }
+
+
+def _map(model: Model, light: Float32[np.ndarray, "texels 3"]) -> dict[str, Any]:
+    return Packed("f2", _four(fill_gutter(model.image(light), model.covered, GUTTER))).entry
 
 
 def _record(light: Light) -> dict[str, Any]:
@@ -210,6 +221,11 @@ def _notes(model: Model) -> list[str]:
         notes.append("The model is of an older version, without albedo: surfaces are shown in one grey. Fit it again.")
     if model.constant is not None:
         notes.append("Surfaces that glow light others; their own radiance is not in the model and is not shown.")
+    if model.fog is not None:
+        notes.append(
+            "Lamps shine through the scene's fog, on surfaces and where they are measured. The air itself is not shown: what "
+            "it sends into the eye, and what it swallows on the way there."
+        )
     if model.layers:
         notes.append(f"Not shown: {', '.join(model.layers)}.")
     return notes

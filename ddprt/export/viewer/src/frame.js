@@ -2,6 +2,7 @@
 import * as THREE from "three";
 import { Bvh } from "./bvh.js";
 import { Composer, dataTexture } from "./compose.js";
+import { misty } from "./fog.js";
 import { opening } from "./holes.js";
 import { Measuring, placed } from "./measure.js";
 import { pierced } from "./pierced.js";
@@ -17,7 +18,7 @@ export const WHITE = 0.5;
 export class Frame {
   constructor(model, renderer) {
     this.model = model;
-    const scene = { centre: model.centre, lift: model.lift, bvh: new Bvh(model.corners, opening(model.holes)) };
+    const scene = { centre: model.centre, lift: model.lift, fog: model.fog, bvh: new Bvh(model.corners, opening(model.holes)) };
     const { points, quantity, depth } = model.manifest;
     this.measuring = new Measuring(model.points, points, quantity, depth, scene);
     this.transfer = new Transfer(model);
@@ -26,9 +27,9 @@ export class Frame {
     texture.minFilter = texture.magFilter = THREE.LinearFilter;
     const parts = pierced(model.holes);
     const geometry = geometryOf(model, parts);
-    this.surface = new Surface(model, geometry, texture, parts, SHADOW);
+    this.surface = new Surface(model, geometry, texture, parts, misty(model.fog), SHADOW);
     this.shadows = new Shadows(renderer, geometry, model.radius, parts, SHADOW);
-    this.references = [];
+    this.stored = new Map();
     this.values = new Float64Array(3 * points);
   }
 
@@ -61,17 +62,21 @@ export class Frame {
       indirect: state.show !== "direct",
       painted: state.albedo,
       stored: state.source === "reference",
-      reference: lighting ? this.#reference(state.lighting) : this.composer.target.texture,
+      reference: lighting ? this.#texture(lighting.indirect) : this.composer.target.texture,
+      spread: Boolean(lighting?.direct),
+      laid: lighting?.direct ? this.#texture(lighting.direct) : this.composer.target.texture,
       exposure: view === ERROR ? 1 / (WHITE * lighting.rms) : view === BASIS ? 1 : stops,
     });
   }
 
-  #reference(index) {
-    const { indirect } = this.model.stored[index];
-    const [height, width] = indirect.shape;
-    this.references[index] ??= dataTexture(indirect, width, height, THREE.RGBAFormat, THREE.HalfFloatType);
-    const texture = this.references[index];
+  /** Of a stored map, made when it is first seen. */
+  #texture(map) {
+    const made = this.stored.get(map);
+    if (made) return made;
+    const [height, width] = map.shape;
+    const texture = dataTexture(map, width, height, THREE.RGBAFormat, THREE.HalfFloatType);
     texture.minFilter = texture.magFilter = THREE.LinearFilter;
+    this.stored.set(map, texture);
     return texture;
   }
 }

@@ -2,15 +2,21 @@
 import { unpack } from "./data.js";
 import { Frame } from "./frame.js";
 import { isLamp, parsed, written } from "./state.js";
+import { missing, refuse, warn } from "./support.js";
 import { MOST } from "./surface.js";
 import { Panel } from "./panel.js";
 import { View } from "./view.js";
 import { listen } from "./keys.js";
 
 function start() {
-  const model = unpack(JSON.parse(document.getElementById("model").textContent));
-  const app = new App(model);
-  window.ddprt = app; // for scripts and tests
+  const lacking = missing();
+  if (lacking) return refuse(lacking);
+  try {
+    window.ddprt = new App(unpack(JSON.parse(document.getElementById("model").textContent))); // for scripts and tests
+  } catch (error) {
+    refuse(`this page could not start: ${error.message}`);
+    throw error;
+  }
 }
 
 class App {
@@ -38,6 +44,7 @@ class App {
     };
     this.state = { ...this.initial };
     this.panel = new Panel(this, document);
+    document.getElementById("warning").addEventListener("click", () => warn(""));
     listen(this);
     window.addEventListener("hashchange", () => this.restore(location.hash));
     this.set(this.initial, { link: false });
@@ -90,10 +97,11 @@ class App {
 
   /** Where a link leads; false if it says nothing or cannot be read. */
   restore(hash) {
-    if (hash === this.linked) return true;
-    const state = parsed(hash, MOST);
-    if (state instanceof Error) this.panel.say(`link: got one that cannot be followed (${state.message}); showing the default`);
-    if (state === null || state instanceof Error) return false;
+    const same = hash === this.linked;
+    const state = same ? null : parsed(hash, MOST);
+    warn(state instanceof Error ? `link: got one that cannot be followed (${state.message}); nothing of it is taken` : "");
+    if (state === null || state instanceof Error) return same;
+    this.linked = hash;
     this.view.look(state.eye ?? this.initial.eye, state.target ?? this.initial.target);
     this.set({ ...this.initial, ...(state.lamps ? { lighting: null } : {}), ...state }, { link: false });
     return true;
@@ -109,6 +117,7 @@ class App {
     clearTimeout(this.linking);
     this.linking = setTimeout(() => {
       this.linked = this.link();
+      warn("");
       try {
         history.replaceState(null, "", this.linked);
       } catch {

@@ -1,4 +1,5 @@
 // Light at the measurement points, as docs/export.md says: with shadow rays, and from behind the surface where `depth` is not 0.
+import { within } from "./fog.js";
 
 export const DRAWN = ["point", "spot", "directional"];
 const radians = (degrees) => (degrees * Math.PI) / 180;
@@ -49,7 +50,7 @@ function arriving(light, x, y, z, normal, at, ray) {
 }
 
 export class Measuring {
-  /** points: position, normal, albedo, home; scene: centre, lift (metres that rays start above the surface), bvh. */
+  /** points: position, normal, albedo, home; scene: centre, lift (metres that rays start above the surface), bvh, fog or null. */
   constructor(points, count, quantity, depth, scene) {
     Object.assign(this, { points, count, depth, scene });
     this.weighted = quantity === "radiosity";
@@ -58,35 +59,48 @@ export class Measuring {
     this.rays = 0;
   }
 
+  // Cosine times what arrives of a unit of light so deep behind a sample, per channel, whatever is on the way but fog.
+  #at(light, at, depth) {
+    const { position, normal } = this.points;
+    const { centre, lift, fog } = this.scene;
+    const place = [0, 1, 2].map((axis) => position[at + axis] - centre[axis] + (lift - depth) * normal[at + axis]);
+    const ray = {};
+    const strength = arriving(light, ...place, normal, at, ray);
+    if (!fog || strength === 0) return [strength, strength, strength];
+    const length = within(fog.half, place, ray);
+    return fog.extinction.map((x) => strength * Math.exp(-x * length));
+  }
+
+  // The same as it is measured: from behind the surface where there is a depth.
+  #measured(light, at) {
+    if (this.depth === 0) return this.#at(light, at, 0);
+    const far = this.#at(light, at, 2 * this.depth);
+    return this.#at(light, at, this.depth).map((near, c) => Math.max(0, 2 * near - far[c]));
+  }
+
   /** (points, 3) W/m² of light records. */
   measure(lights) {
     const { position, normal, albedo, home } = this.points;
-    const { centre, lift } = this.scene;
+    const { centre, lift, bvh, fog } = this.scene;
     const values = new Float64Array(3 * this.count);
     const ready = lights.map((light) => placed(light, centre));
     const ray = {};
     this.rays = 0;
     for (let i = 0; i < home.length; i++) {
       const at = 3 * i;
-      const place = (depth, axis) => position[at + axis] - centre[axis] + (lift - depth) * normal[at + axis];
-      const x = place(0, 0);
-      const y = place(0, 1);
-      const z = place(0, 2);
+      const [x, y, z] = [0, 1, 2].map((axis) => position[at + axis] - centre[axis] + lift * normal[at + axis]);
       for (const light of ready) {
-        const bare = light.type === "spot" ? { ...light, type: "point" } : light; // a cone casts no shadow
-        let strength = arriving(this.depth > 0 ? bare : light, x, y, z, normal, at, ray);
+        const bare = light.type === "spot" && this.depth > 0 ? { ...light, type: "point" } : light; // a cone casts no shadow
+        const strength = arriving(bare, x, y, z, normal, at, ray);
         if (strength <= 0) continue;
-        const { x: dx, y: dy, z: dz, distance } = ray;
-        if (this.depth > 0 && light.type !== "directional") {
-          const sunk = (depth) => arriving(light, place(depth, 0), place(depth, 1), place(depth, 2), normal, at, ray);
-          strength = Math.max(0, 2 * sunk(this.depth) - sunk(2 * this.depth));
-          if (strength === 0) continue;
-        }
+        const plain = !fog && (this.depth === 0 || light.type === "directional");
+        const shone = plain ? null : this.#measured(light, at);
+        if (shone?.every((part) => part === 0)) continue;
         this.rays++;
-        if (this.scene.bvh.occluded(x, y, z, dx, dy, dz, Math.max(distance - lift, 0))) continue;
-        const share = strength / this.sizes[home[i]];
+        if (bvh.occluded(x, y, z, ray.x, ray.y, ray.z, Math.max(ray.distance - lift, 0))) continue;
+        const share = 1 / this.sizes[home[i]];
         for (let c = 0; c < 3; c++)
-          values[3 * home[i] + c] += share * light.colour[c] * (this.weighted ? albedo[at + c] : 1);
+          values[3 * home[i] + c] += (shone?.[c] ?? strength) * share * light.colour[c] * (this.weighted ? albedo[at + c] : 1);
       }
     }
     return values;

@@ -136,6 +136,11 @@ export class Panel {
     this.#list(state);
   }
 
+  #omitted({ omitted }) {
+    const kinds = Object.entries(omitted).map(([kind, count]) => `${count} ${kind}`);
+    return kinds.length ? `; lamps without a mark: ${kinds.join(", ")}; direct light from the dataset's lightmap` : "";
+  }
+
   #told(state, frame) {
     const { trust, milliseconds } = frame;
     const dark = frame.scale.every((x) => x === 0);
@@ -149,7 +154,7 @@ export class Panel {
     this.at("meter").value = score ?? 0;
     const lighting = this.app.model.stored[state.lighting];
     this.at("error-told").textContent = lighting
-      ? `relative error ${percent(lighting.error)} with all bases${lighting.omitted ? `; ${lighting.omitted} of its lamps are not drawn` : ""}` +
+      ? `relative error ${percent(lighting.error)} with all bases${this.#omitted(lighting)}` +
         (state.source === "error" ? `; white: an error of ${number(WHITE * lighting.rms)} W/m²` : "")
       : "";
     const spent = milliseconds.measure + milliseconds.weigh;

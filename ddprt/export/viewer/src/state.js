@@ -35,7 +35,7 @@ export function parsed(hash, most) {
   const checks = {
     eye: triple,
     target: triple,
-    lamps: (value) => Array.isArray(value) && value.length <= most && value.every(isLamp),
+    lamps: (value) => Array.isArray(value) && value.every(isLamp),
     chosen: (value) => Number.isInteger(value),
     show: (value) => SHOWS.includes(value),
     source: (value) => SOURCES.includes(value),
@@ -46,6 +46,7 @@ export function parsed(hash, most) {
     lighting: (value) => value === null || Number.isInteger(value),
   };
   if (state === null || typeof state !== "object") return new Error("it holds no state");
+  if (state.lamps?.length > most) return new Error(`${state.lamps.length} lamps, at most ${most}`);
   for (const [key, value] of Object.entries(state)) if (!checks[key]?.(value)) return new Error(`"${key}" is not as expected`);
   return state;
 }

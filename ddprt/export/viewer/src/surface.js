@@ -18,12 +18,14 @@ precision highp float; precision highp sampler2DArray;
 const float PI = 3.14159265358979;
 in vec3 place; in vec2 where; flat in vec3 facing; out vec4 result;
 uniform sampler2D ours; uniform sampler2D reference; uniform sampler2D paint; uniform sampler2D exitant;
+uniform sampler2D laid;
 uniform sampler2DArray shadows;
 uniform int lamps; uniform int kinds[MOST]; uniform vec3 positions[MOST]; uniform vec3 directions[MOST]; uniform vec3 rights[MOST];
 uniform vec3 ups[MOST]; uniform vec3 colours[MOST]; uniform vec2 cones[MOST];
 uniform float radius; uniform float exposure; uniform float size;
-uniform bool direct; uniform bool indirect; uniform bool painted; uniform bool stored; uniform bool exits; uniform int view;
+uniform bool direct; uniform bool spread; uniform bool indirect; uniform bool painted; uniform bool stored; uniform bool exits; uniform int view;
 HOLES
+FOG
 float lit(int layer, vec2 at, float depth) {
   vec2 p = at * size - 0.5; ivec2 low = ivec2(floor(p)); vec2 part = p - floor(p);
   float sum = 0.0;
@@ -41,7 +43,7 @@ vec3 arriving(int i, vec3 n) {
     float texel = 2.0 * radius / size;
     vec3 p = place + 2.0 * texel * n;
     vec2 at = vec2(dot(p, rights[i]), dot(p, ups[i])) / radius * 0.5 + 0.5;
-    return cosine * colours[i] * lit(6 * i, at, dot(p, directions[i]) + radius - texel);
+    return cosine * colours[i] * veil(place, -directions[i], 1e30) * lit(6 * i, at, dot(p, directions[i]) + radius - texel);
   }
   vec3 away = positions[i] - place; float d = length(away); vec3 to = away / d;
   float cosine = dot(to, n), strength = cosine / (d * d);
@@ -59,7 +61,7 @@ vec3 arriving(int i, vec3 n) {
   else { face = v.z > 0.0 ? 4 : 5; f = vec3(0.0, 0.0, sign(v.z)); }
   vec3 r = normalize(cross(f, f.y != 0.0 ? vec3(0.0, 0.0, 1.0) : vec3(0.0, 1.0, 0.0))), u = cross(r, f);
   vec2 at = vec2(dot(v, r), dot(v, u)) / dot(v, f) * 0.5 + 0.5;
-  return strength * colours[i] * lit(6 * i + face, at, length(v) - texel);
+  return strength * colours[i] * veil(place, to, d) * lit(6 * i + face, at, length(v) - texel);
 }
 vec3 heat(float x) {  // black, blue, red, yellow, white at quarters
   x = clamp(x, 0.0, 1.0) * 4.0;
@@ -77,7 +79,10 @@ void main() {
     return;
   }
   vec3 light = indirect ? map : vec3(0.0);
-  if (direct && !(exits && texture(exitant, where).r > 0.5)) for (int i = 0; i < MOST; i++) if (i < lamps) light += arriving(i, n);
+  if (direct && !(exits && texture(exitant, where).r > 0.5)) {
+    if (spread) light += texture(laid, where).rgb;
+    else for (int i = 0; i < MOST; i++) if (i < lamps) light += arriving(i, n);
+  }
   result = vec4(display(exposure * light / PI * (painted ? texture(paint, where).rgb : vec3(1.0))), 1.0);
 }`;
 
@@ -92,7 +97,7 @@ export function geometryOf(model, holes) {
 }
 
 export class Surface {
-  constructor(model, geometry, composed, pierced, size) {
+  constructor(model, geometry, composed, pierced, misty, size) {
     const [, height, width] = model.maps.shape;
     const byte = (data, format) => data && dataTexture(data, width, height, format, THREE.UnsignedByteType);
     const paint = byte(model.albedo, THREE.RGBAFormat) ?? dataTexture(new Uint8Array([188, 188, 188, 255]), 1, 1);
@@ -102,8 +107,11 @@ export class Surface {
     const vectors = () => ({ value: list(() => new THREE.Vector3()) });
     this.uniforms = {
       ...pierced.uniforms,
+      ...misty.uniforms,
       ours: { value: composed },
       reference: { value: composed },
+      laid: { value: composed },
+      spread: { value: false },
       paint: { value: paint },
       exitant: { value: byte(model.exitant, THREE.RedFormat) ?? paint },
       exits: { value: Boolean(model.exitant) },
@@ -128,7 +136,7 @@ export class Surface {
     const material = new THREE.RawShaderMaterial({
       glslVersion: THREE.GLSL3,
       vertexShader: pierced.vertex(VERTEX),
-      fragmentShader: FRAGMENT.replaceAll("MOST", MOST).replace("HOLES", pierced.fragment),
+      fragmentShader: FRAGMENT.replaceAll("MOST", MOST).replace("HOLES", pierced.fragment).replace("FOG", misty.fragment),
       side: THREE.FrontSide, // backs do not hide: a room is looked into from outside
       uniforms: this.uniforms,
     });

@@ -10,8 +10,6 @@ export class View {
     Object.assign(this, { model, canvas, told });
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, preserveDrawingBuffer: true });
     this.renderer.autoClear = false;
-    if (!this.renderer.extensions.has("EXT_color_buffer_float"))
-      throw new Error("this browser cannot draw into float textures (EXT_color_buffer_float); use another one");
     this.scene = new THREE.Scene();
     const radius = model.radius;
     this.camera = new THREE.PerspectiveCamera(model.camera.fov, 1, 0.01 * radius, 100 * radius);
@@ -121,7 +119,7 @@ export class View {
   #picking() {
     let down = null;
     const ray = new THREE.Raycaster();
-    this.canvas.addEventListener("pointerdown", (event) => (down = [event.clientX, event.clientY]));
+    this.canvas.addEventListener("pointerdown", (event) => (down = event.isPrimary ? [event.clientX, event.clientY] : null));
     this.canvas.addEventListener("pointerup", (event) => {
       if (!down || this.held || Math.hypot(event.clientX - down[0], event.clientY - down[1]) > 5) return;
       const box = this.canvas.getBoundingClientRect();
