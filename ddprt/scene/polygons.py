@@ -16,10 +16,13 @@ import numpy as np
 
 from ddprt.axes import Float, Int
 from ddprt.errors import UserError
+from ddprt.scene import obj_faces, ply_faces
 from ddprt.scene.checks import UNSAID, checked
 from ddprt.scene.images import linear_image, srgb_to_linear
 from ddprt.scene.material import Material, plain
 from ddprt.scene.mesh import Scene
+
+_TRIANGULATED = {"obj": obj_faces.with_triangles, "ply": ply_faces.with_triangles}
 
 EXACT_COLOURS = 4096
 """Different colours that each become a material; where a file has more, they are rounded to 32 levels per channel."""
@@ -40,8 +43,9 @@ def load_polygons(path: Path, *, lightmap: bool = False) -> Scene:
     kind = path.suffix.lower()[1:]
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
-        parts = [_part(name, mesh, kind) for name, mesh in _parsed(path, kind).items() if mesh.get("faces") is not None]
-        notes = _absent(path, kind)
+        meshes, notes = _parsed(path, kind)
+        parts = [_part(name, mesh, kind) for name, mesh in meshes.items() if mesh.get("faces") is not None]
+        notes += _absent(path, kind)
     if not parts:
         raise UserError(f"{path.name}: got no triangles, expected a mesh; the file may be cut short")
     number: dict[str, int] = {}
@@ -79,7 +83,8 @@ class _Part:
     notes: list[str]
 
 
-def _parsed(path: Path, kind: str) -> dict[str, Any]:
+def _parsed(path: Path, kind: str) -> tuple[dict[str, Any], list[str]]:
+    """What trimesh finds in the file, mesh by mesh, and what to note of its polygons."""
     from trimesh.exchange.load import mesh_loaders
     from trimesh.resolvers import FilePathResolver
 
@@ -87,9 +92,10 @@ def _parsed(path: Path, kind: str) -> dict[str, Any]:
     data = path.read_bytes()
     if kind == "obj":
         data = _as_utf8(data)
+    data, notes = _TRIANGULATED[kind](path, data) if kind in _TRIANGULATED else (data, [])
     with io.BytesIO(data) as stream:
         loaded = mesh_loaders[kind](stream, file_type=kind, resolver=FilePathResolver(str(path)), **split)
-    return loaded.get("geometry", {path.stem: loaded})
+    return loaded.get("geometry", {path.stem: loaded}), notes
 
 
 def _as_utf8(data: bytes) -> bytes:
