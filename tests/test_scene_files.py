@@ -178,6 +178,15 @@ def spoil(writer: Writer, **entries: object) -> Writer:
     return writer
 
 
+def laid(accessor: dict | None = None, **view: int) -> Writer:
+    """A triangle whose positions lie in a buffer otherwise than the format allows."""
+    writer = one()
+    writer.data += bytes(64)
+    writer.json["accessors"][0] |= accessor or {}
+    writer.json["bufferViews"][0] |= {"byteLength": 64, **view}
+    return writer
+
+
 @pytest.mark.parametrize(
     ("writer", "says"),
     [
@@ -204,6 +213,15 @@ def spoil(writer: Writer, **entries: object) -> Writer:
         ),
         (lambda: spoil(one(), nodes=[{"mesh": "a"}]), "got a damaged file, expected glTF 2.0, whole JSON .*; export it again"),
         (lambda: spoil(one(), bufferViews=[{"buffer": 0, "byteOffset": 0, "byteLength": 10**6}] * 3), "cut short"),
+        (
+            lambda: laid(byteStride=4),
+            r"got byteStride 4 of buffer view 0 for rows of 12 bytes \(accessor 0\), expected as many or",
+        ),
+        (lambda: laid(byteStride=14), "got byteStride 14 .*, in steps of 4"),
+        (lambda: laid(byteOffset=2), "got byteOffset 0 of accessor 0 in buffer view 0 at 2, expected both together"),
+        (lambda: laid({"byteOffset": 6}, byteOffset=6), "got byteOffset 6 of accessor 0 in buffer view 0 at 6"),
+        (lambda: spoil(one(), asset={"version": "1.0"}), "got glTF of version 1.0, expected 2.0"),
+        (lambda: spoil(one(), asset={"version": "2.1", "minVersion": "2.1"}), "got glTF of version 2.1 that asks for 2.1"),
         (lambda: spoil(textured(), images=[{"uri": "nowhere.png"}]), 'no "nowhere.png" beside it'),
         (lambda: spoil(textured(), images=[{"uri": "data:image/png;base64,AAAA"}]), "image 0 that cannot be read"),
         (lambda: spoil(textured(texCoord=1), images=[{"uri": "x"}]), "no TEXCOORD_1"),
