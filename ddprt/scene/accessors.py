@@ -162,7 +162,7 @@ def open_gltf(path: Path) -> Container:
     """Read the JSON of a .glb (known by its first four bytes) or a .gltf.
 
     Raises:
-      UserError: the file is shorter than its header says, or of another version. What else pygltflib meets is raised as it comes.
+      UserError: the file is shorter than its header says, or of another version. What else it meets is raised as it comes.
     """
     data = path.read_bytes()
     if data[:4] != b"glTF":

@@ -69,7 +69,7 @@ def pack(model: Model, data: Dataset | None = None, *, stitch: bool = True) -> d
             "again with --geometry MESH, or bake and fit again"
         )
     tracer = Tracer(model.occluders, holes=model.holes)
-    camera = camera_for(model.scene["name"], model.occluders)
+    camera = camera_for(model.scene["name"], model.occluders, model.viewpoint)
     with tempfile.TemporaryDirectory() as folder:
         export_textures(model, folder, gutter=GUTTER, stitch=stitch)
         found = _exported(Path(folder))
