@@ -232,7 +232,8 @@ VERBS = {
         relight,
         "MODEL",
         {
-            "lighting": "FILE|JSON  a list of lightings, or one as text",
+            "lighting": "FILE|JSON  a list of lightings, one as text, or a glTF file, all of whose lights shine",
+            "units": "photometric|radiometric  of a glTF file's lights: candela and lux (default), or W/sr and W/m²",
             "out": "FILE.exr  where to (default: relit.exr)",
             "time": "SECONDS  when, for a model of an animation",
         },

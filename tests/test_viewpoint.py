@@ -92,17 +92,37 @@ def test_a_camera_without_extent_sees_nothing(tmp_path: Path) -> None:
         load_scene(writer.glb(tmp_path / "a.glb"))
 
 
+EYE = Viewpoint((0.3, 0.25, 0.5), (0.2, 0.2, 0.0), (0.0, 1.0, 0.1), 70.0, 1.5)
+
+
+def test_a_dataset_keeps_the_viewpoint(cornell: Scene, tmp_path: Path) -> None:
+    small = base(atlas__resolution=24, lightings__train=2, lightings__validation=1, lightings__test=1, transport__samples=1)
+    bake(replace(cornell, viewpoint=EYE), config=small, out=tmp_path)
+    assert ddprt.open_dataset(tmp_path).viewpoint == EYE
+
+
+@pytest.mark.parametrize(
+    "change", [{"up": [-0.1, -0.05, -0.5]}, {"fov_deg": 180.0}, {"aspect": 0.0}, {"target": EYE.eye}, {"eye": [np.nan] * 3}]
+)
+def test_a_viewpoint_that_sees_nothing_is_refused(change: dict) -> None:
+    assert Viewpoint.of(EYE.record, "here") == EYE
+    with pytest.raises(UserError, match=r"^here: got .* from where nothing can be seen"):
+        Viewpoint.of(EYE.record | change, "here")
+    for given in ({}, EYE.record | {"eye": 1.0}, [1]):
+        with pytest.raises(UserError, match=r"^here: got .* expected eye, target, up and fov_deg"):
+            Viewpoint.of(given, "here")
+
+
+@pytest.mark.slow
 def test_a_viewpoint_reaches_the_viewer(cornell: Scene, tmp_path: Path) -> None:
     """Through dataset and model, which the viewer knows alone."""
-    eye = Viewpoint((0.3, 0.25, 0.5), (0.2, 0.2, 0.0), (0.0, 1.0, 0.1), 70.0, 1.5)
-    data = bake(replace(cornell, viewpoint=eye), config=base(), out=tmp_path / "data")
-    assert ddprt.open_dataset(tmp_path / "data").viewpoint == eye
+    data = bake(replace(cornell, viewpoint=EYE), config=base(), out=tmp_path / "data")
     ddprt.fit(data, bases=4).save(tmp_path / "model")
     model = ddprt.load_model(tmp_path / "model")
-    assert model.viewpoint == eye
+    assert model.viewpoint == EYE
     assert pack(model)["camera"] == {"eye": [0.3, 0.25, 0.5], "target": [0.2, 0.2, 0.0], "fov": 70.0, "up": [0.0, 1.0, 0.1]}
     document = json.loads((tmp_path / "model" / "model.json").read_text())
-    document["viewpoint"]["up"] = [-0.1, -0.05, -0.5]  # along the line of sight
+    document["viewpoint"]["up"] = [0, 0, 0]
     (tmp_path / "model" / "model.json").write_text(json.dumps(document))
     with pytest.raises(UserError, match=r"model\.json: viewpoint: got .* from where nothing can be seen"):
         ddprt.load_model(tmp_path / "model")

@@ -7,6 +7,8 @@ from typing import Any
 
 from ddprt.errors import UserError
 
+_ASKEW = 1e-6  # sine of the angle between what is upright and the line of sight, at least
+
 Triple = tuple[float, float, float]
 
 
@@ -63,7 +65,8 @@ class Viewpoint:
         x, y, z = self.up
         side = (forward[1] * z - forward[2] * y, forward[2] * x - forward[0] * z, forward[0] * y - forward[1] * x)
         wide = self.aspect is None or 0 < self.aspect < math.inf
-        return wide and 0 < self.fov_deg < 180 and 0 < math.hypot(*side) < math.inf
+        least = _ASKEW * math.hypot(*forward) * math.hypot(x, y, z)
+        return wide and 0 < self.fov_deg < 180 and least < math.hypot(*side) < math.inf
 
 
 def _triple(given: Any) -> Triple:
