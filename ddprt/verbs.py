@@ -17,9 +17,26 @@ def run(call: Call) -> None:
 
 def inspect(call: Call) -> None:
     """what a scene is, what light it calls for, and what a bake would do"""
-    from ddprt.pipeline_inspect import describe
+    from ddprt.pipeline_inspect import examine
 
-    print(describe(call.file("a configuration, a scene name or a mesh"), call.overrides))
+    source, html = call.file("a configuration, a scene name or a mesh"), call.options.get("html")
+    if html is not None and Path(html).suffix.lower() not in (".html", ".htm"):
+        raise UserError(f"--html: got {html}, expected a path that ends in .html; name it so")
+    found = examine(source, call.overrides)
+    print(found.text)
+    if html is None and not call.asks("open"):
+        return
+    from tempfile import mkdtemp
+
+    from ddprt.files import write_text
+
+    page = Path(html or Path(mkdtemp(prefix="ddprt-")) / "inspect.html")
+    write_text(page, found.page())
+    print(f"page        {page}")
+    if call.asks("open"):
+        import webbrowser
+
+        webbrowser.open(page.absolute().as_uri())
 
 
 def bake(call: Call) -> None:
@@ -207,7 +224,12 @@ _SOURCES = {
 }
 VERBS = {
     "run": Verb(run, options=_OUT),
-    "inspect": Verb(inspect, "FILE.toml|SCENE|MESH"),
+    "inspect": Verb(
+        inspect,
+        "FILE.toml|SCENE|MESH",
+        {"html": "FILE.html  write what is found as a page, with pictures of texels, charts and normals"},
+        {"open": "the same in the browser"},
+    ),
     "bake": Verb(bake, options=_OUT, flags={"dry-run": "tell seconds, rays, files and memory beforehand; writes nothing"}),
     "import": Verb(
         import_, "DIR|FILE.toml", _OUT | _SOURCES, {"clip": "cut negative light off instead of refusing it"}, configured=False
