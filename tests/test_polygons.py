@@ -103,6 +103,11 @@ def test_random_outlines_of_many_sizes_at_once() -> None:
         [[0, 0], [1, 1], [1, 0], [0, 1]],  # two lobes that cancel out
         [[0, 0], [3, 2], [3, 0], [0, 1]],
         [[np.cos(a), np.sin(a)] for a in np.arange(5) * 4 * np.pi / 5],
+        [[2, 3], [1, 1], [3, 4], [0, 0], [3, 1]],  # whose corners could be taken for ears to the end
+        [
+            [0, 0],
+            *([np.cos(0.9 * k) * (1 + 0.1 * k), np.sin(0.9 * k) * (1 + 0.1 * k)] for k in range(10)),
+        ],  # round its first one
     ],
 )
 def test_outlines_that_cross_themselves_are_told(outline: list) -> None:

@@ -368,6 +368,10 @@ def test_obj_colours_count_only_where_no_material_speaks(tmp_path: Path) -> None
     (tmp_path / "a.obj").write_text(mesh.format(""))
     scene = load_scene(tmp_path / "a.obj")
     np.testing.assert_array_equal(scene.colour, [[1, 0, 0]] * 3)
+    (tmp_path / "b.obj").write_text(mesh.format("v 0 0 1 0 0 1\nf 1 4 2\n"))  # corners that are shared
+    both = load_scene(tmp_path / "b.obj")
+    assert both.colour is not None
+    np.testing.assert_array_equal(both.colour[:, 2], both.positions[:, 2])
     assert scene.materials[0].albedo == (1.0, 1.0, 1.0)
     (tmp_path / "room.mtl").write_text(MTL)
     (tmp_path / "a.obj").write_text("mtllib room.mtl\n" + mesh.format("usemtl red\n"))
