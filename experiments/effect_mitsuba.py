@@ -42,6 +42,9 @@ PARTS = 16
 """Of a sky's pixel along each side, for the same reason."""
 TETRAHEDRON = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])[[[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]]]
 
+ELSEWHERE = ("probes", "fog", "subsurface", "hair")
+"""Not asked here: Mitsuba has no probes; the others have tests of their own (tests/test_mitsuba_fog.py and so on)."""
+
 POINT = {"type": "point", "position": [0.28, 0.45, 0.2], "intensity": [1.0, 1.0, 1.0]}
 LIGHTS: dict[str, dict[str, Any]] = {
     "point lights": POINT,
@@ -77,7 +80,7 @@ class Stage:
 
 def second_opinion(name: str) -> dict[str, float] | None:
     """Mean and deviation of z-scores of an effect; None where Mitsuba has none of it."""
-    if name in ("probes", "fog"):  # fog: tests/test_mitsuba_fog.py
+    if name in ELSEWHERE:
         return None
     if name == "emission":
         z = glowing_scores(build("neon"))

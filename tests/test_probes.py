@@ -431,12 +431,6 @@ def test_no_probe_in_free_air_is_refused(cornell: Scene) -> None:
         baked(cornell, job(probes={"grid": [0] * 3}), None, [[0.186, 0.08, 0.169]])
 
 
-def test_probes_belong_to_the_operator(cornell: Scene) -> None:
-    for integrator in ("paths", "reference"):
-        with pytest.raises(UserError, match="knows no probes"):
-            ddprt.bake(cornell, config=job(transport={"integrator": integrator}))
-
-
 def test_probes_are_planned(cornell: Scene) -> None:
     called = {effect.name: effect for effect in plan(cornell, [LAMP], probes="2 x 2 x 2").effects}["probes"]
     assert called.called

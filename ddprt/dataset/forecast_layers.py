@@ -15,8 +15,8 @@ from ddprt.dataset.probes import NAME, name_shut, name_unlit, placed_probes, sca
 from ddprt.dataset.sampled import Expected, Sampled, on_a_line
 from ddprt.dataset.store import CONSTANT, read_map, write_map
 from ddprt.transport.effects import plan, probed
-from ddprt.transport.glossiness import glossy
-from ddprt.transport.sources import Sent, Shown
+from ddprt.transport.glossiness import glossy, valid_integrator
+from ddprt.transport.sources import Sent, Shown, Source, Walked
 
 _TEXELS = 1 << 14  # that tell what samples of direct light cost, and how many are needed
 _LOOKS, _LOOKED_AT = 64, 1 << 12  # rays that tell whether any light reaches a probe, and probes that are asked
@@ -60,7 +60,7 @@ def _probes(
         name_shut(layer, job.progress)
     seconds, rays, position = 0.0, 0.0, layer.position[layer.weight > 0]
     if job.config.transport.bounces != 0 and scatters(job.scene):
-        source: Sent | Shown
+        source: Source
         making, again = 0.0, (0.0, 0.0)
         before, begun = job.tracer.rays, time.perf_counter()
         if any(glossy(job.scene)):
@@ -70,6 +70,10 @@ def _probes(
             making = (1, 2.5)[halves - 1] * reading  # maps: 2, or 3 and 2
             before, begun = job.tracer.rays, time.perf_counter()
             step = import_module("ddprt.transport.lit_probes").CALL
+        elif valid_integrator(job.config.transport.integrator, job.scene) != "operator":
+            walked = job.tracer, job.scene, [job.lightings[index] for index in indices], job.bounces or 1
+            source, columns = Walked.of(*walked, seed=job.config.seed, stream=f"{split} 0"), len(indices)
+            step = import_module("ddprt.transport.path_probes").CALL
         else:
             source = sent or _sent(job, split, indices, seen)
             columns, step = source.bounced.radiosity.shape[1] // 3, module.CALL
@@ -108,7 +112,7 @@ def _sent(job: Sampled, split: str, indices: list[int], seen: list[int]) -> Sent
     return Sent(operator, operator.bounce(direct, bounces=1, **address), address | {"near": near})
 
 
-def _gathered(source: Sent | Shown, position: np.ndarray, rays: int) -> None:
+def _gathered(source: Source, position: np.ndarray, rays: int) -> None:
     for _ in source.gather(position, rays):
         pass
 

@@ -14,7 +14,7 @@ from ddprt.config import Config
 from ddprt.dataset.denoise import denoised
 from ddprt.dataset.gloss import GlossBake
 from ddprt.dataset.manifest import Manifest, map_name
-from ddprt.dataset.probes import ProbeBake, scatters
+from ddprt.dataset.probes import ProbeBake
 from ddprt.dataset.sampled import scratched, stored
 from ddprt.dataset.scratch import Scratch
 from ddprt.dataset.store import CONSTANT, Dataset, read_map, write_map
@@ -27,7 +27,7 @@ from ddprt.transport.embree import Tracer
 from ddprt.transport.footprint import Footprints
 from ddprt.transport.glossiness import glossy
 from ddprt.transport.hairiness import borrowed_along
-from ddprt.transport.sources import Sent, Shown
+from ddprt.transport.sources import Sent, Shown, Source, Walked
 from ddprt.transport.translucency import filled
 
 _SHARE, _LARGE = 64, 1 << 26  # of maps in the making that is tried out; bytes below which they take no time that matters
@@ -67,9 +67,7 @@ class IndirectBake:
             sent = cache(sent)  # of maps, bodies and probes
         self._maps(split, indices, sent, self._leaving(split, indices, sent))
         if self._probes:
-            dark = self.config.transport.bounces == 0 or not scatters(self.scene)
-            source = partial(self._seen, split, indices) if any(glossy(self.scene)) else sent
-            self._probes.run(split, indices, source, self.progress, dark=dark)
+            self._probes.run(split, indices, self._source(split, indices, sent), self.progress)
         for layer in self._glossy:
             layer.run(split, indices, partial(self._shown, split, indices), self.progress)
 
@@ -99,7 +97,7 @@ class IndirectBake:
         sharing = split != "test" and config.footprint > 0 and given != 1  # neighbours share walks where nothing is scored on
         with self.progress.stage(f"subsurface {split}", (len(kinds) + sharing) * len(texels)) as stage:
             for half in range(len(kinds)):
-                light, address = sent(half).bounced.arrived, {"seed": self.config.seed, "stream": f"{split} {half}"}
+                light, address = sent(half).bounced.arrived, self._address(split, half)
                 if given == "auto":
                     each, noise = self._passing.choose(light, config.target_noise * len(kinds) ** 0.5, **address)
                     given = each * len(kinds)
@@ -120,7 +118,7 @@ class IndirectBake:
             stage.facts["integrator"] = integrator = self.dataset.description["transport"]["integrator"]
             if self.effects.bounces == 0:
                 dark = np.zeros((len(indices), self.atlas.count, 3), np.float32)
-                self._finish([dark] * len(kinds), indices, todo, kinds, lambda light: light, leaving)
+                self._finish([dark] * len(kinds), indices, todo, kinds, np.asarray, leaving)
             elif integrator == "reference":
                 self._by_reference(split, todo, kinds, stage)
             elif integrator == "paths":
@@ -165,18 +163,26 @@ class IndirectBake:
 
     def _sent(self, split: str, indices: list[int], half: int) -> Sent:
         """What the senders of a half of a split send to its lightings' maps and probes."""
-        operator, stream = self._operator, f"{split} {half}"
+        operator, address = self._operator, self._address(split, half)
         bounces = self.effects.bounces or 1  # of a lonely convex body, whose light reaches probes alone
         direct = self._averaged(operator, indices, half)
-        bounced = operator.bounce(direct, seed=self.config.seed, stream=stream, bounces=bounces)
+        bounced = operator.bounce(direct, **address, bounces=bounces)
         near = operator.near([self.dataset.lightings[index] for index in indices], direct, bounces=bounces)
-        return Sent(operator, bounced, {"seed": self.config.seed, "stream": stream, "near": near})
+        return Sent(operator, bounced, address | {"near": near})
 
-    def _seen(self, split: str, indices: list[int], half: int) -> Shown:
-        """What rays of probes end in where something glosses."""
+    def _source(self, split: str, indices: list[int], sent: Callable[[int], Sent]) -> Callable[[int], Source]:
+        """What rays of probes end in, for each half."""
         lightings = [self.dataset.lightings[index] for index in indices]
-        seen = self.tracer, self.scene, self.atlas, lightings, self._shown(split, indices, half)
-        return Shown.of(*seen, seed=self.config.seed, stream=f"{split} {half}")
+        if any(glossy(self.scene)):
+            scene = self.tracer, self.scene, self.atlas, lightings
+            return lambda half: Shown.of(*scene, self._shown(split, indices, half), **self._address(split, half))
+        if self.dataset.description["transport"]["integrator"] == "operator":
+            return sent
+        walks = self.tracer, self.scene, lightings, self.effects.bounces or 1  # as in `_sent`
+        return lambda half: Walked.of(*walks, **self._address(split, half))
+
+    def _address(self, split: str, half: int) -> dict[str, Any]:
+        return {"seed": self.config.seed, "stream": f"{split} {half}"}
 
     def _by_operator(
         self,
@@ -214,12 +220,11 @@ class IndirectBake:
                         f"unasked leave {expected:.2g}; raise it, or set transport.{'test_' if test else ''}samples"
                     )
             scratch = self._scratch(split, half, indices, rays=seeds.digest(rays))
-            self._follow(
-                scratch, operator.gather(bounced.radiosity, scratch.maps, rays, skip=scratch.done, **address), stage, rays
-            )
+            tiles = operator.gather(bounced.radiosity, scratch.maps, rays, skip=scratch.done, **address)
+            self._follow(scratch, tiles, stage, rays)
             parts.append(scratch)
-        pooled = footprints.pooled if footprints else lambda light: light
-        self._finish([part.maps for part in parts], indices, todo, kinds, pooled, leaving)
+        last = footprints.pooled if footprints else np.asarray
+        self._finish([part.maps for part in parts], indices, todo, kinds, last, leaving)
         for part in parts:
             part.remove()
 
@@ -268,22 +273,17 @@ class IndirectBake:
     ) -> None:
         """Writes the maps: the mean of two halves and half their difference, or what `last` makes of the only part.
 
-        What leaves bodies takes its place in them. Where few rays meet something near, noise may reach below zero
-        (transport/near.py). It ends here, which changes the Cornell box's energy by 1.5e-5 at 8 rays per texel, by 8e-7 at 32
-        and not at all at the default noise.
+        What leaves bodies takes its place in them. Few rays that meet something near (transport/near.py) may reach below zero,
+        which ends here: 1.5e-5 of the Cornell box's energy at 8 rays per texel, 8e-7 at 32, nothing at the default noise.
         """
 
         def finished(index: int) -> list[np.ndarray]:
             row = indices.index(index)
-            halves = [part[row] for part in parts]
-            if len(halves) == 1:
-                halves = [last(halves[0])]
+            halves = [part[row] for part in parts] if len(parts) > 1 else [last(parts[0][row])]
             for half, (texels, values) in enumerate(leaving):
                 halves[half] = halves[half].copy()
                 halves[half][texels] = values[row]
-            if len(halves) == 1:
-                return [np.maximum(halves[0], 0)]
-            return [np.maximum((halves[0] + halves[1]) / 2, 0), (halves[0] - halves[1]) / 2]
+            return [np.maximum(sum(halves) / len(halves), 0), (halves[0] - halves[-1]) / 2][: len(halves)]
 
         self._write(todo, finished, kinds)
 
@@ -312,9 +312,9 @@ class IndirectBake:
 
     def _direct(self, half: int) -> Callable[[int], Float32[np.ndarray, "texels 3"]]:
         """Direct light of a lighting on the texels: as it was baked, or a second time for an independent half."""
-        covered, seed, samples = self.dataset.covered, self.config.seed, self.config.transport.direct_samples
+        seed, samples = self.config.seed, self.config.transport.direct_samples
         if half == 0:
-            return lambda index: read_map(self.dataset.folder / map_name("direct", index))[covered]
+            return lambda index: read_map(self.dataset.folder / map_name("direct", index))[self.dataset.covered]
         texels = Texels.of(self.tracer, self.atlas, samples, seeds.stream(seed, "texel positions", half))
         return lambda index: texels.irradiance(self.dataset.lightings[index], seeds.stream(seed, "direct", index, half))
 

@@ -1,8 +1,8 @@
 """The layer of probes in a dataset: where they stand, and their light under every lighting.
 
 Probes take the light that the senders send to the lightmap, so they cost their own rays alone; where something glosses their
-rays end in the lightmaps. Held-out lightings are the mean
-of two independent halves, with half their difference as "noise", as in the lightmap.
+rays end in the lightmaps, and where the lightmap is made without senders they are first steps of paths. Held-out lightings are
+the mean of two independent halves, with half their difference as "noise", as in the lightmap.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,32 +24,27 @@ from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
 from ddprt.transport.effects import Plan, plan, probed
 from ddprt.transport.embree import Tracer
-from ddprt.transport.glossiness import glossy, valid_integrator
-from ddprt.transport.sources import Sent, Shown
+from ddprt.transport.fogginess import hazy
+from ddprt.transport.glossiness import glossy
+from ddprt.transport.sources import Shown, Source
 
 NAME = "probes"
 _NAMED = 8  # probes that a message spells out
 
 
 def scatters(scene: Scene) -> bool:
-    """Whether any surface sends light on."""
-    return any(entry.brightest for entry in scene.materials) or any(glossy(scene))
+    """Whether anything sends light on: a surface, or fog."""
+    return any(entry.brightest for entry in scene.materials) or any(glossy(scene)) or hazy(scene)
 
 
 def probe_layers(config: Config, scene: Scene) -> list[dict[str, Any]]:
     """What dataset.json tells of probes, and all that their light depends on; empty where there are none.
 
     Raises:
-      UserError: probes cannot be placed, or are asked of an integrator that knows none.
+      UserError: probes cannot be placed.
     """
     if not probed(config, scene):
         return []
-    integrator = valid_integrator(config.transport.integrator, scene)
-    if integrator != "operator" and not any(glossy(scene)):
-        raise UserError(
-            f'transport.integrator: got "{integrator}", which knows no probes where nothing glosses, expected the operator; '
-            'set it to "auto", or effects.off = ["probes"]'
-        )
     probes = import_module("ddprt.transport.probes")
     position = probes.places(config.probes, scene.bounds)
     places = {"count": len(position), "digest": probes.digest(position), "rays": config.probes.rays}
@@ -90,11 +85,13 @@ class ProbeBake:
     Attributes:
       module: of the effect.
       layer: the probes.
+      dark: no light leaves a surface or fog, or none is to be followed.
       config, tracer, dataset, manifest: of the bake.
     """
 
     module: ModuleType
     layer: Layer
+    dark: bool
     config: Config
     tracer: Tracer
     dataset: Dataset
@@ -113,19 +110,19 @@ class ProbeBake:
         if module is None:
             return None
         if manifest.holds(layer_name(NAME, "places")):
-            return cls(module, read_layer(dataset, NAME), config, tracer, dataset, manifest)
-        layer = placed_probes(module, config, scene, tracer, atlas)
-        write_places(dataset.folder, layer, manifest)
-        return cls(module, layer, config, tracer, dataset, manifest)
+            layer = read_layer(dataset, NAME)
+        else:
+            layer = placed_probes(module, config, scene, tracer, atlas)
+            write_places(dataset.folder, layer, manifest)
+        dark = config.transport.bounces == 0 or not scatters(scene)
+        return cls(module, layer, dark, config, tracer, dataset, manifest)
 
     def run(
         self,
         split: str,
         indices: Sequence[int],
-        sent: Callable[[int], Sent | Shown],
+        sent: Callable[[int], Source],
         progress: Progress,
-        *,
-        dark: bool,
     ) -> None:
         """Bakes the probes of a split's lightings where some are missing.
 
@@ -133,7 +130,6 @@ class ProbeBake:
           split, indices: "train" (with validation) or "test", and its lightings.
           sent: the light of each half.
           progress: told of the stage, and of probes that are not in free air.
-          dark: no light leaves a surface, or none is to be followed.
         """
         kinds = ("light", "noise")[: 1 + (split == "test")]
         todo = layer_lacks(self.manifest, NAME, kinds, indices)
@@ -144,7 +140,7 @@ class ProbeBake:
             before = self.tracer.rays
             stage.facts |= {"probes": len(valid), "in_the_open": int(valid.sum())}
             halves = [np.zeros((len(indices), len(valid), self.layer.coefficients, 3), np.float32) for _ in kinds]
-            if not dark:
+            if not self.dark:
                 rays = 0
                 for half, light in enumerate(halves):
                     source = sent(half)
@@ -193,7 +189,7 @@ class ProbeBake:
         write_light(self.dataset.folder, NAME, "constant", light, self.manifest)
         return dict(found.facts)
 
-    def _rays(self, source: Sent | Shown, halves: int, stage: Any) -> int:
+    def _rays(self, source: Source, halves: int, stage: Any) -> int:
         """Rays of each probe, as configured or as the noise that is aimed at asks."""
         given = self.config.probes.rays
         if given == "auto":
@@ -205,7 +201,7 @@ class ProbeBake:
         stage.facts["samples"] = rays * halves
         return int(rays)
 
-    def _gathered(self, source: Sent | Shown, rays: int, stage: Any) -> Float32[np.ndarray, "lightings valid harmonics 3"]:
+    def _gathered(self, source: Source, rays: int, stage: Any) -> Float32[np.ndarray, "lightings valid harmonics 3"]:
         position = self.layer.position[self.layer.weight > 0]
         parts = []
         for part in source.gather(position, rays):

@@ -155,8 +155,8 @@ class Network:
 def gated(values: Float[Array, "*_"]) -> Float[Array, "*_"]:
     """a (1 + a / (1 + |a|)) / 2: the activation of all networks here.
 
-    SiLU with Elliott's sigmoid: as smooth as it need be, without an exponential, in training as in a shader. On coefficients of
-    light it errs no more than SiLU and less than GELU (docs/rivals.md).
+    SiLU with Elliott's sigmoid: as smooth as it need be, without an exponential, in training as in a shader. A network alone on
+    coefficients of light errs no more by it than by SiLU, and less than by GELU or ReLU (docs/rivals.md).
 
     Reference: Elfwing, Uchibe and Doya, "Sigmoid-weighted linear units", Neural Networks 2018; Elliott, "A better activation
     function for artificial neural networks", 1993.

@@ -12,7 +12,7 @@ from ddprt.scene.mesh import Scene
 from ddprt.transport.hairiness import hairy
 from ddprt.transport.translucency import filled
 
-BESIDE = ("gloss", "emission", "subsurface", "hair", "probes")
+BESIDE = ("gloss", "emission", "subsurface", "hair")
 """Effects that nothing simulates yet in a scene with fog."""
 
 _FLAT = 1e-6  # of the bounding box's diagonal: a thinner box holds no air
@@ -21,6 +21,11 @@ _FLAT = 1e-6  # of the bounding box's diagonal: a thinner box holds no air
 def foggy(scene: Scene) -> bool:
     """Whether there is fog, and room for it in the bounding box."""
     return scene.fog is not None and float(np.ptp(scene.bounds, axis=0).min()) > 2 * _FLAT * scene.radius
+
+
+def hazy(scene: Scene) -> bool:
+    """Whether there is fog that scatters light."""
+    return scene.fog is not None and any(scene.fog.albedo) and foggy(scene)
 
 
 def refuse_beside_fog(called: Callable[[str], bool]) -> None:
@@ -33,10 +38,9 @@ def refuse_beside_fog(called: Callable[[str], bool]) -> None:
     """
     found = [name for name in BESIDE if called(name)] if called("fog") else []
     if found:
-        remedy = "ask for no probes" if found == ["probes"] else f'set effects.off = ["{found[0]}"] or ["fog"]'
         raise UserError(
             f"effects: got fog beside {' and '.join(found)}, which is not simulated yet, expected one without the other; "
-            f"{remedy}"
+            f'set effects.off = ["{found[0]}"] or ["fog"]'
         )
 
 
