@@ -1,5 +1,6 @@
 """What would happen, without doing it: the text of `ddprt inspect` and `ddprt doctor`."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,31 @@ _LOOKED_AT = 8  # lightings that stand for all
 _FORESEEN = "gloss", "cut-outs", "two-sided sheets", "emission", "probes"  # what takes more than lamps and bounces
 
 
-def describe(source: str, overrides: dict[str, str]) -> str:
-    """A scene, its atlas and its plan in words.
+@dataclass(frozen=True)
+class Examined:
+    """A scene as a bake would have it, and what there is to say of it, a name and a text in each line."""
+
+    text: str
+    config: Config
+    scene: Any
+    tracer: Any
+    atlas: Any
+
+    def page(self) -> str:
+        """All of it as HTML, with pictures and what a bake is expected to take."""
+        from ddprt.dataset.forecast import forecast
+        from ddprt.report.inspection import inspection_page
+
+        try:
+            words = str(forecast(self.scene, self.config))
+        except UserError as error:
+            words = f"cannot be told: {error}"
+        rows = [("forecast" if k == 0 else "").ljust(12) + line for k, line in enumerate(words.splitlines())]
+        return inspection_page(self.scene, self.tracer, self.atlas, "\n".join([self.text, *rows]))
+
+
+def examine(source: str, overrides: dict[str, str]) -> Examined:
+    """A scene, its atlas and its plan.
 
     Args:
       source: a configuration, a scene name or a mesh file.
@@ -79,7 +103,8 @@ def describe(source: str, overrides: dict[str, str]) -> str:
             told, foreseen = _foreseen(scene, config)
             bake, costs = bake + told, {**foreseen, **costs}
     known = [line for line in effects.lines(costs) if lightings or not line.split(":")[0].endswith(" lights")]
-    return "\n".join([*lines, *(f"effect      {line}" for line in known), *bake])
+    text = "\n".join([*lines, *(f"effect      {line}" for line in known), *bake])
+    return Examined(text, config, scene, tracer, atlas)
 
 
 def _poses(config: Config) -> str:

@@ -17,9 +17,26 @@ def run(call: Call) -> None:
 
 def inspect(call: Call) -> None:
     """what a scene is, what light it calls for, and what a bake would do"""
-    from ddprt.pipeline_inspect import describe
+    from ddprt.pipeline_inspect import examine
 
-    print(describe(call.file("a configuration, a scene name or a mesh"), call.overrides))
+    source, html = call.file("a configuration, a scene name or a mesh"), call.options.get("html")
+    if html is not None and Path(html).suffix.lower() not in (".html", ".htm"):
+        raise UserError(f"--html: got {html}, expected a path that ends in .html; name it so")
+    found = examine(source, call.overrides)
+    print(found.text)
+    if html is None and not call.asks("open"):
+        return
+    from tempfile import mkdtemp
+
+    from ddprt.files import write_text
+
+    page = Path(html or Path(mkdtemp(prefix="ddprt-")) / "inspect.html")
+    write_text(page, found.page())
+    print(f"page        {page}")
+    if call.asks("open"):
+        import webbrowser
+
+        webbrowser.open(page.absolute().as_uri())
 
 
 def bake(call: Call) -> None:
@@ -212,7 +229,12 @@ _SOURCES = {
 }
 VERBS = {
     "run": Verb(run, options=_OUT),
-    "inspect": Verb(inspect, "FILE.toml|SCENE|MESH"),
+    "inspect": Verb(
+        inspect,
+        "FILE.toml|SCENE|MESH",
+        {"html": "FILE.html  write what is found as a page, with pictures of texels, charts and normals"},
+        {"open": "the same in the browser"},
+    ),
     "bake": Verb(bake, options=_OUT, flags={"dry-run": "tell seconds, rays, files and memory beforehand; writes nothing"}),
     "import": Verb(
         import_, "DIR|FILE.toml", _OUT | _SOURCES, {"clip": "cut negative light off instead of refusing it"}, configured=False
@@ -237,7 +259,8 @@ VERBS = {
         relight,
         "MODEL",
         {
-            "lighting": "FILE|JSON  a list of lightings, or one as text",
+            "lighting": "FILE|JSON  a list of lightings, one as text, or a glTF file, all of whose lights shine",
+            "units": "photometric|radiometric  of a glTF file's lights: candela and lux (default), or W/sr and W/m²",
             "out": "FILE.exr  where to (default: relit.exr)",
             "time": "SECONDS  when, for a model of an animation",
         },

@@ -5,7 +5,7 @@ Imports stay inside them, so that help is instant.
 
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, cast, get_args
 
 from ddprt.call import Call
 from ddprt.errors import UserError
@@ -41,7 +41,7 @@ def relight(call: Call) -> None:
     """turn a lighting into an indirect lightmap: ddprt relight MODEL --lighting lights.json --out relit.exr"""
     import json
 
-    from ddprt.lights import load_lightings, parse_lighting, scene_lights
+    from ddprt.lights import Units, load_lightings, parse_lighting, scene_lights
     from ddprt.methods.method import STATUSES
     from ddprt.scene.exr import write_exr
 
@@ -52,6 +52,11 @@ def relight(call: Call) -> None:
         )
     if out.suffix != ".exr":
         raise UserError(f"--out: got {out}, expected a path that ends in .exr; name it so")
+    is_gltf, units = Path(source).suffix.lower() in (".glb", ".gltf"), call.options.get("units", "photometric")
+    if units not in get_args(Units):
+        raise UserError(f'--units: got "{units}", expected {" or ".join(get_args(Units))}; mend it')
+    if call.asks("units") and not is_gltf:
+        raise UserError(f"--units: got {units} for lights of ddprt's own list, which are in W/sr, W/m²; leave it out")
     model = _model_at(call, call.file("a model folder such as runs/cornell/model.ddprt"))
     if source.lstrip().startswith(("[", "{")):
         try:
@@ -62,8 +67,8 @@ def relight(call: Call) -> None:
             raise UserError(
                 f'--lighting: got text that is not JSON ({error}), expected [{{"type": "point", ...}}] or the like; mend it'
             ) from None
-    elif Path(source).suffix.lower() in (".glb", ".gltf"):
-        lightings = [scene_lights(source)]
+    elif is_gltf:
+        lightings = [scene_lights(source, cast("Units", units))]
     else:
         lightings = load_lightings(source)
     for index, lighting in enumerate(lightings):

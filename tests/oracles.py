@@ -1,5 +1,7 @@
 """Slow obvious twins: float64, loops, nothing shared with what they check but the definitions."""
 
+import math
+
 import mpmath
 import numpy as np
 from scipy import stats
@@ -361,3 +363,20 @@ def exact_singular_values(columns: np.ndarray, weights: np.ndarray) -> np.ndarra
         roots = [mpmath.sqrt(mpmath.mpf(float(weight))) for weight in weights]
         rows = mpmath.matrix([[mpmath.mpf(float(v)) * root for v, root in zip(row, roots, strict=True)] for row in columns])
         return np.array([float(value) for value in mpmath.svd_r(rows, compute_uv=False)])
+
+
+def winding_number(outline: np.ndarray, place: np.ndarray) -> int:
+    """How often a plane outline runs round a place, by the angles that its edges are seen under."""
+    total = 0.0
+    for start, end in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+        a, b = start - place, end - place
+        total += math.atan2(a[0] * b[1] - a[1] * b[0], a[0] * b[0] + a[1] * b[1])
+    return round(total / (2 * math.pi))
+
+
+def covers(triangle: np.ndarray, place: np.ndarray) -> bool:
+    """Whether a plane triangle has a place inside, on the left of all its edges."""
+    return all(
+        (b[0] - a[0]) * (place[1] - a[1]) > (b[1] - a[1]) * (place[0] - a[0])
+        for a, b in zip(triangle, np.roll(triangle, -1, axis=0), strict=True)
+    )

@@ -2,12 +2,15 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from gltf_files import Writer, one
+from small_job import call
 
 import ddprt
+from ddprt import verbs_alone
 from ddprt.config import load_config
 from ddprt.dataset.splits import choose_lightings
 from ddprt.errors import UserError
@@ -127,3 +130,41 @@ def test_json_lists_are_read_as_before(tmp_path: Path) -> None:
     lamp = {"type": "point", "position": [0, 1, 0], "intensity": [683, 683, 683]}
     (tmp_path / "a.json").write_text(json.dumps([[lamp]]))
     assert load_lightings(tmp_path / "a.json") == [(PointLight(position=(0, 1, 0), intensity=(683,) * 3),)]
+
+
+def test_relight_takes_the_lights_of_a_file_in_its_units(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The verb asks a model that keeps what shone and answers with black."""
+    path, shone = lit(POINT, SUN).glb(tmp_path / "lit.glb"), list[Any]()
+
+    class Dark:
+        def measure(self, lighting: Any) -> np.ndarray:
+            shone.append(lighting)
+            return np.zeros((1, 3))
+
+        def predict(self, values: np.ndarray, lightings: Any) -> np.ndarray:
+            return values
+
+        def image(self, light: np.ndarray) -> np.ndarray:
+            return np.zeros((2, 2, 3), np.float32)
+
+        def trust(self, values: np.ndarray) -> Any:
+            return None
+
+    monkeypatch.setattr(verbs_alone, "_model_at", lambda call, folder: Dark())
+    given = ("relight", "model.ddprt", "--lighting", path, "--out", tmp_path / "out.exr")
+    for units in ([], ["--units", "photometric"], ["--units", "radiometric"]):
+        assert call(*given, *units) == 0
+    assert shone == [scene_lights(path), scene_lights(path), scene_lights(path, "radiometric")]
+    assert shone[0] != shone[2]
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--lighting", "a.glb", "--units", "candela"], '--units: got "candela", expected photometric or radiometric'),
+        (["--lighting", "[]", "--units", "radiometric"], "--units: got radiometric for lights of ddprt's own list"),
+    ],
+)
+def test_faulty_units_are_told(words: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call("relight", "model.ddprt", *words) == 2
+    assert says in capsys.readouterr().err

@@ -193,9 +193,11 @@ def test_faulty_tables_are_told(case: str, tmp_path: Path) -> None:
     [
         ("photos", 'got "photos" first'),
         ("2\na.png 0 0 1\n", "got 1 lines for 2"),
-        ("1\na.png 0 0\n", "in line 1, expected a name and a direction"),
-        ("1\na.png 0 0 0\n", "in line 1, expected a name and a direction"),
-        ("1\nb c.png 0 0 1\n", "got b c.png in line 1, which is not there"),
+        ("1\na.png 0 0\n", "in line 2, expected a name and a direction"),
+        ("1\n\na.png 0 0 0\n", "in line 3, expected a name and a direction"),
+        ("1\nb c.png 0 0 1\n", "got b c.png in line 2, which is not there"),
+        ("2\na.png 0 0 1\na.png 0 1 1\n", "got a.png again in line 3, expected each photograph once"),
+        ("", 'got "" first'),
     ],
 )
 def test_faulty_light_positions_are_told(text: str, told: str, tmp_path: Path) -> None:

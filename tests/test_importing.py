@@ -270,6 +270,8 @@ FAULTS: dict[str, tuple[Callable[[Path], None], Options, str]] = {
     "no albedo": (lambda f: None, {"quantity": "radiance"}, "no albedo to divide by"),
     "bright albedo": (_picture("albedo.exr", 2.0), {}, "got albedo 1 to 2, expected 0 to 1"),
     "black": (lambda f: [write_exr(p, np.zeros((4, 6, 3), np.float32)) for p in (f / "indirect").iterdir()], {}, "got black pictures"),  # noqa: E501
+    "dark where it counts": (lambda f: write_exr(f / "mask.exr", np.eye(4, 6, dtype=np.float32)[:, :, None] * np.eye(4)[0][:, None, None].astype(np.float32)), {}, "got maps that are black at all 1 texels that count"),  # noqa: E501
+    "no points": (lambda f: None, {"points": "0"}, "--points: got 0, expected 1 to 23"),
     "points": (lambda f: None, {"points": "99"}, "--points: got 99, but 23 texels count"),
     "point outside": (lambda f: (f / "points.json").write_text('[{"texel": [0, 0]}]'), {"points": "points.json"}, "got texel [0, 0], which does not count"),  # noqa: E501
     "no stars": (lambda f: None, {"direct": "direct/1.exr"}, "with 0 stars, expected one"),
@@ -297,6 +299,57 @@ def test_faults_are_told_in_one_line(case: str, tmp_path: Path) -> None:
     assert told in str(caught.value)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "out" / "dataset.json").exists()
+
+
+def board(folder: Path, lit: slice, gap: float = 0.5, rows: tuple[float, float] = (0.0, 0.5)) -> Path:
+    """Maps of 8 x 8 of which some rows are lit, and a mesh of two charts: between `rows` of the map, so far apart."""
+    light = np.zeros((8, 8, 3), np.float32)
+    light[lit] = 1
+    for index in range(5):
+        for kind in ("direct", "indirect"):
+            write_exr(folder / kind / f"{index}.exr", light * (1 + index))
+    (folder / "lights.csv").write_text("name,type,x,y,z,r,g,b\n" + "".join(f"{k},point,0,1,0,1,1,1\n" for k in range(7)))
+    text, (top, bottom), wide = "", rows, (1 - gap) / 2
+    for chart, left in enumerate((0.0, 1 - wide)):
+        places = [(left, bottom), (left + wide, bottom), (left + wide, top), (left, top)]
+        text += "".join(f"v {u + chart} {0.0} {v}\nvt {u} {1 - v}\n" for u, v in places)
+        text += "f " + " ".join(f"{k}/{k}" for k in range(4 * chart + 1, 4 * chart + 5)) + "\n"
+    (folder / "room.obj").write_text(text)
+    return folder
+
+
+BOARD = {"geometry": "room.obj", "quantity": "irradiance", "points": "3"}
+
+
+@pytest.mark.parametrize(("lit", "upside"), [(slice(4, 8), True), (slice(4, 4), False)])
+def test_maps_that_are_black_where_they_count_are_refused(tmp_path: Path, lit: slice, upside: bool) -> None:
+    board(tmp_path, lit)
+    if not upside:  # lit where no chart is, whichever way up
+        for path in (tmp_path / "indirect").iterdir():
+            write_exr(path, np.pad(np.ones((8, 1, 3), np.float32), ((0, 0), (3, 4), (0, 0))))
+    with pytest.raises(UserError, match="got maps that are black at all 16 texels that count") as caught:
+        imported(tmp_path, tmp_path / "out", **BOARD)
+    assert ("they look upside down" in str(caught.value)) == upside
+
+
+def test_an_import_says_what_it_leaves_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    board(tmp_path, slice(0, 4))
+    for name in ("position", "normal"):
+        write_exr(tmp_path / f"{name}.exr", np.ones((8, 8, 3), np.float32))
+    _, _, found = load_recipe(tmp_path, BOARD)
+    assert "position.exr, normal.exr: left aside for the mesh of --geometry" in found
+    with pytest.warns(Doubt, match='2 lightings name no picture and are left out, the first "5"') as told:
+        data = imported(tmp_path, tmp_path / "out", **BOARD)
+    assert not any("apart" in str(one.message) for one in told)
+    assert any("name no picture" in note for note in data.imported["notes"])
+
+
+@pytest.mark.parametrize(("gap", "said"), [(0.0, True), (0.125, False)])
+def test_charts_that_touch_are_told(tmp_path: Path, gap: float, said: bool) -> None:
+    board(tmp_path, slice(0, 4), gap=gap + 0.125 * (gap > 0))
+    with pytest.warns(Doubt) as told:
+        imported(tmp_path, tmp_path / "out", **BOARD)
+    assert any("charts of room.obj are not one texel apart" in str(one.message) for one in told) == said
 
 
 def test_negative_light_is_cut_off_where_it_is_asked(tmp_path: Path) -> None:

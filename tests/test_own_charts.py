@@ -15,7 +15,7 @@ from ddprt.config import load_config
 from ddprt.dataset.sameness import baked_settings
 from ddprt.errors import UserError
 from ddprt.files import read_tensors
-from ddprt.pipeline_inspect import describe
+from ddprt.pipeline_inspect import examine
 from ddprt.scene.atlas import build_atlas
 from ddprt.scene.files import load_scene
 from ddprt.scene.mesh import Scene
@@ -156,8 +156,8 @@ def test_settings_of_older_datasets_stay_as_they_were(cornell: Scene) -> None:
 def test_inspect_says_whose_charts_they_are(sound: Path) -> None:
     more = {"lightings.train": "1", "atlas.resolution": "32", "transport.samples": "1", "transport.test_samples": "2"}
     more |= {"lightings.kinds": '["point"]', "transport.bounces": "0"}
-    assert "2 charts of the file" in describe(str(sound), more)
-    told = describe(str(sound), {**more, "atlas.use": '"new"'})
+    assert "2 charts of the file" in examine(str(sound), more).text
+    told = examine(str(sound), {**more, "atlas.use": '"new"'}).text
     assert "of the file" not in told
     assert "is not used, as asked" in told
 

@@ -15,6 +15,7 @@ from PIL import Image
 from ddprt.errors import UserError
 from ddprt.scene.files import load_scene
 from ddprt.scene.images import linear_image, srgb_to_linear
+from ddprt.scene.material import Emission
 from ddprt.scene.shapes import icosphere
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning:dataclasses_json")
@@ -178,6 +179,15 @@ def spoil(writer: Writer, **entries: object) -> Writer:
     return writer
 
 
+def laid(accessor: dict | None = None, **view: int) -> Writer:
+    """A triangle whose positions lie in a buffer otherwise than the format allows."""
+    writer = one()
+    writer.data += bytes(64)
+    writer.json["accessors"][0] |= accessor or {}
+    writer.json["bufferViews"][0] |= {"byteLength": 64, **view}
+    return writer
+
+
 @pytest.mark.parametrize(
     ("writer", "says"),
     [
@@ -204,6 +214,15 @@ def spoil(writer: Writer, **entries: object) -> Writer:
         ),
         (lambda: spoil(one(), nodes=[{"mesh": "a"}]), "got a damaged file, expected glTF 2.0, whole JSON .*; export it again"),
         (lambda: spoil(one(), bufferViews=[{"buffer": 0, "byteOffset": 0, "byteLength": 10**6}] * 3), "cut short"),
+        (
+            lambda: laid(byteStride=4),
+            r"got byteStride 4 of buffer view 0 for rows of 12 bytes \(accessor 0\), expected as many or",
+        ),
+        (lambda: laid(byteStride=14), "got byteStride 14 .*, in steps of 4"),
+        (lambda: laid(byteOffset=2), "got byteOffset 0 of accessor 0 in buffer view 0 at 2, expected both together"),
+        (lambda: laid({"byteOffset": 6}, byteOffset=6), "got byteOffset 6 of accessor 0 in buffer view 0 at 6"),
+        (lambda: spoil(one(), asset={"version": "1.0"}), "got glTF of version 1.0, expected 2.0"),
+        (lambda: spoil(one(), asset={"version": "2.1", "minVersion": "2.1"}), "got glTF of version 2.1 that asks for 2.1"),
         (lambda: spoil(textured(), images=[{"uri": "nowhere.png"}]), 'no "nowhere.png" beside it'),
         (lambda: spoil(textured(), images=[{"uri": "data:image/png;base64,AAAA"}]), "image 0 that cannot be read"),
         (lambda: spoil(textured(texCoord=1), images=[{"uri": "x"}]), "no TEXCOORD_1"),
@@ -297,7 +316,41 @@ def test_obj_with_materials_and_texture(tmp_path: Path) -> None:
     albedo = scene.albedo_at(np.repeat(first, 3), np.array(CORNERS))
     for corner, seen in zip(scene.corners[first[0]], albedo, strict=True):
         np.testing.assert_allclose(seen, corners[corner[0], corner[2]], atol=1e-5)
-    assert 'ignored in material "red": ke' in scene.notes
+    assert scene.materials[names.index("red")].emission == Emission((1.0, 0.0, 0.0))
+    assert scene.materials[names.index("print")].emission is None
+    assert not any("red" in note for note in scene.notes)
+
+
+@pytest.mark.parametrize(
+    ("words", "opacity"),
+    [
+        ("d 0.25\n", 0.25),
+        ("Tr 0.75\n", 0.25),
+        ("d 0.25\nTr 0\n", 0.25),
+        ("d -halo 0\n", 0.0),
+        ("d 0.75\n", 0.75),
+        ("d 1\nTr 0\n", 1.0),
+    ],
+)
+def test_obj_surfaces_that_are_rather_not_there_are_holes(tmp_path: Path, words: str, opacity: float) -> None:
+    path = write_obj(tmp_path)
+    (tmp_path / "room.mtl").write_text(MTL.replace("Ke 1 0 0\nd 1.0\n", words))
+    scene = load_scene(path)
+    (red,) = (entry for entry in scene.materials if entry.name == "red")
+    assert (red.cutout is not None) == (opacity < 0.5)
+    if red.cutout is not None:
+        assert (red.cutout.opacity < red.cutout.cutoff).all()
+    fate = "a hole" if opacity < 0.5 else "opaque"
+    said = [note for note in scene.notes if '"red"' in note]
+    assert said == ([f'material "red": opacity {opacity:g} is not simulated; taken as {fate}'] if opacity < 1 else [])
+
+
+@pytest.mark.parametrize(("words", "says"), [("Ke 1 0", "got ke 1 0, expected 1 or 3"), ("d half", "got d half, expected 1")])
+def test_faulty_words_of_a_material_are_told(tmp_path: Path, words: str, says: str) -> None:
+    path = write_obj(tmp_path)
+    (tmp_path / "room.mtl").write_text(f"newmtl red\nKd 1 1 1\n{words}\n")
+    with pytest.raises(UserError, match=says):
+        load_scene(path)
 
 
 def test_obj_says_which_files_are_missing(tmp_path: Path) -> None:
@@ -313,10 +366,18 @@ def test_obj_says_which_files_are_missing(tmp_path: Path) -> None:
 def test_obj_colours_count_only_where_no_material_speaks(tmp_path: Path) -> None:
     mesh = "v 0 0 0 1 0 0\nv 1 0 0 1 0 0\nv 0 1 0 1 0 0\n{}f 1 2 3\n"
     (tmp_path / "a.obj").write_text(mesh.format(""))
-    assert load_scene(tmp_path / "a.obj").materials[0].albedo == (1.0, 0.0, 0.0)
+    scene = load_scene(tmp_path / "a.obj")
+    np.testing.assert_array_equal(scene.colour, [[1, 0, 0]] * 3)
+    (tmp_path / "b.obj").write_text(mesh.format("v 0 0 1 0 0 1\nf 1 4 2\n"))  # corners that are shared
+    both = load_scene(tmp_path / "b.obj")
+    assert both.colour is not None
+    np.testing.assert_array_equal(both.colour[:, 2], both.positions[:, 2])
+    assert scene.materials[0].albedo == (1.0, 1.0, 1.0)
     (tmp_path / "room.mtl").write_text(MTL)
     (tmp_path / "a.obj").write_text("mtllib room.mtl\n" + mesh.format("usemtl red\n"))
-    assert load_scene(tmp_path / "a.obj").materials[0].albedo == (0.1234567, 0.25, 0.5)
+    scene = load_scene(tmp_path / "a.obj")
+    assert scene.colour is None
+    assert scene.materials[0].albedo == (0.1234567, 0.25, 0.5)
 
 
 def test_obj_groups_without_materials_stay_apart_and_normals_are_kept(tmp_path: Path) -> None:
@@ -382,16 +443,30 @@ def test_ply_says_that_its_texture_is_missing(tmp_path: Path) -> None:
     assert "texture gone.png is missing" in load_scene(tmp_path / "a.ply").notes
 
 
-def test_many_vertex_colours_are_rounded(tmp_path: Path) -> None:
+def test_colours_of_vertices_blend_between_them(tmp_path: Path) -> None:
+    """As those of glTF do, and exactly; linear light is what blends."""
     import trimesh
 
-    points, triangles = icosphere(5)
+    points, triangles = icosphere(2)
     colours = ((points + 1) * 127.5).astype(np.uint8)
     trimesh.Trimesh(points, triangles, vertex_colors=colours, process=False).export(tmp_path / "ball.ply")
     scene = load_scene(tmp_path / "ball.ply")
+    weights = np.random.default_rng(4).dirichlet(np.ones(3), len(triangles))
+    expected = np.einsum("tc,tcd->td", weights, srgb_to_linear(colours[triangles] / 255.0))
+    np.testing.assert_allclose(scene.albedo_at(np.arange(len(triangles)), weights), expected, atol=1e-12)
+    assert len(scene.materials) == 1
+
+
+def test_many_face_colours_are_rounded(tmp_path: Path) -> None:
+    import trimesh
+
+    points, triangles = icosphere(5)
+    colours = ((points[triangles].mean(1) + 1) * 127.5).astype(np.uint8)
+    trimesh.Trimesh(points, triangles, face_colors=colours, process=False).export(tmp_path / "ball.ply")
+    scene = load_scene(tmp_path / "ball.ply")
     assert 100 < len(scene.materials) <= 4096
     assert any("32 levels" in note for note in scene.notes)
-    expected = srgb_to_linear(colours[triangles] / 255.0).mean(1)
+    expected = srgb_to_linear(colours / 255.0)
     seen = scene.albedo_at(np.arange(len(triangles)), np.full((len(triangles), 3), 1 / 3))
     assert np.abs(np.sqrt(seen) - np.sqrt(expected)).max() <= 0.51 / 31
 

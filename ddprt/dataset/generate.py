@@ -252,6 +252,7 @@ class _Bake:
             "quantity": "irradiance",
             **({"exitant": exitant} if (exitant := self._exitant()) else {}),
             **({"fog": self.scene.fog.record} if self.scene.fog else {}),
+            **({"viewpoint": self.scene.viewpoint.record} if self.scene.viewpoint else {}),
             "unit": "W/m2",
             "points": self._points(samples),
             "plan": [asdict(effect) for effect in effects.effects],

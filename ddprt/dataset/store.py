@@ -27,6 +27,7 @@ from ddprt.scene.exr import exposure_for, read_exr, write_exr
 from ddprt.scene.fog import Fog
 from ddprt.scene.holes import Holes
 from ddprt.scene.mesh import Scene
+from ddprt.scene.viewpoint import Viewpoint
 from ddprt.transport.translucency import exitant_texels
 
 SCHEMA = 1
@@ -164,6 +165,12 @@ class Dataset:
         """
         given = self.description.get("fog")
         return None if given is None else Fog.of(given, f"{self.folder / 'dataset.json'}: fog")
+
+    @property
+    def viewpoint(self) -> Viewpoint | None:
+        """From where the scene's maker would have it seen; None where nobody says. Raises UserError where it is damaged."""
+        given = self.description.get("viewpoint")
+        return None if given is None else Viewpoint.of(given, f"{self.folder / 'dataset.json'}: viewpoint")
 
     def maps(self, kind: str, indices: Sequence[int]) -> Float32[np.ndarray, "lightings texels 3"]:
         """Lightmaps of the covered texels in W/m²; kind is "direct", "indirect" or (held-out lightings) "noise"."""

@@ -15,6 +15,7 @@ from scipy.sparse import csr_matrix
 
 from ddprt.axes import Bool, Float, Float32, Float64, Int
 from ddprt.scene.mesh import Scene
+from ddprt.scene.viewpoint import Viewpoint
 from ddprt.transport.embree import Hits, Tracer
 
 _LAYERS = 8  # back faces that a ray may pass
@@ -78,12 +79,14 @@ _CAMERAS = {
 
 
 def default_camera(scene: Scene) -> Camera:
-    """A camera that sees the whole scene: the customary one for library scenes, else from outside at three quarters."""
-    return camera_for(scene.name, scene.corners)
+    """That of its file, or the customary one of library scenes, or one that sees all of it from outside at three quarters."""
+    return camera_for(scene.name, scene.corners, scene.viewpoint)
 
 
-def camera_for(name: str, triangles: Float64[np.ndarray, "triangles 3 3"]) -> Camera:
-    """The same by the scene's name and its triangles' corners, metres."""
+def camera_for(name: str, triangles: Float64[np.ndarray, "triangles 3 3"], given: Viewpoint | None = None) -> Camera:
+    """The same by the scene's name, its triangles' corners (metres), and where its file has it seen from."""
+    if given is not None:
+        return Camera(given.eye, given.target, given.fov_deg, given.aspect or Camera.aspect, given.up)
     if name in _CAMERAS:
         return _CAMERAS[name]
     away = _unit(np.array([0.5, 0.55, 1.0]))

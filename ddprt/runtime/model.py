@@ -24,6 +24,7 @@ from ddprt.runtime.trust import Trust, Yardstick
 from ddprt.sampling.points import Samples
 from ddprt.scene.fog import Fog
 from ddprt.scene.holes import Holes
+from ddprt.scene.viewpoint import Viewpoint
 
 _LARGEST = float(np.finfo(np.float32).max)
 _AT_ONCE = 64  # lightings whose samples are averaged into points together
@@ -54,6 +55,7 @@ class Model:
         there are none.
       albedo: of the covered texels, linear, to show them by; no answer depends on it. None in models of older versions.
       fog: what fills the bounding box of the occluders; None for clear air.
+      viewpoint: from where a viewer starts; None for its own choice. No answer depends on it.
     """
 
     method: str
@@ -74,6 +76,7 @@ class Model:
     exitant: np.ndarray | None = None
     albedo: np.ndarray | None = None
     fog: Fog | None = None
+    viewpoint: Viewpoint | None = None
 
     def predict(
         self,

@@ -26,6 +26,7 @@ from ddprt.runtime.trust import Yardstick
 from ddprt.sampling.points import Samples
 from ddprt.scene.fog import Fog
 from ddprt.scene.holes import Holes
+from ddprt.scene.viewpoint import Viewpoint
 
 SCHEMA = 1
 ANIMATION = "animation.json"
@@ -138,6 +139,7 @@ def save_model(model: Model, folder: Path) -> None:
         "report": asdict(model.relighter.report),
         "trust": trust or None,
         **({"fog": model.fog.record} if model.fog else {}),
+        **({"viewpoint": model.viewpoint.record} if model.viewpoint else {}),
         **({"layers": [_layer_entry(part.layer) for part in model.layers.values()]} if model.layers else {}),
         "unit": "W/m2",
         "tensors_sha256": sha256(folder / "tensors.safetensors"),
@@ -263,6 +265,7 @@ def _assemble(
         exitant,
         paint,
         None if document.get("fog") is None else Fog.of(document["fog"], "model.json: fog"),
+        None if document.get("viewpoint") is None else Viewpoint.of(document["viewpoint"], "model.json: viewpoint"),
     )
 
 

@@ -140,6 +140,7 @@ def fit_method(
         None if isinstance(data, LayerData) else data.exitant,
         None if isinstance(data, LayerData) else data.gbuffer["albedo"],
         None if isinstance(data, LayerData) else data.fog,
+        None if isinstance(data, LayerData) else data.viewpoint,
     )
 
 

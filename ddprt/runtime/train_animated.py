@@ -92,6 +92,7 @@ def fit_animation(data: AnimatedData, config: Config) -> dict[str, AnimatedModel
             constant=constants[0],
             exitant=_any_exitant(data),
             albedo=data.albedo,
+            viewpoint=first.viewpoint,
         )
         return AnimatedModel(
             rest,

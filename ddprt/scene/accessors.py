@@ -92,10 +92,19 @@ class Container:
     def _rows(self, number: int, view: int, offset: int | None, kind: np.dtype, shape: tuple[int, int]) -> np.ndarray:
         """Rows as they lie in a buffer view, without a copy."""
         count, width = shape
-        step = self.entry("bufferViews", view).byteStride or kind.itemsize * width
-        data, start = self.view(view), offset or 0
-        if step < 0:
-            raise self.fault(f"got byteStride {step} of buffer view {view}, expected 4 to 252; export it again")
+        entry = self.entry("bufferViews", view)
+        least, data, start = kind.itemsize * width, self.view(view), offset or 0
+        step = least if entry.byteStride is None else entry.byteStride
+        if step < least or step % kind.itemsize:
+            raise self.fault(
+                f"got byteStride {step} of buffer view {view} for rows of {least} bytes (accessor {number}), expected as many "
+                f"or more, in steps of {kind.itemsize}; export it again"
+            )
+        if (start + (entry.byteOffset or 0)) % kind.itemsize or start % kind.itemsize:
+            raise self.fault(
+                f"got byteOffset {start} of accessor {number} in buffer view {view} at {entry.byteOffset or 0}, expected both "
+                f"together, and the accessor's own, in steps of the {kind.itemsize} bytes of its numbers; export it again"
+            )
         end = start + (count - 1) * step + width * kind.itemsize if count else start
         if not 0 <= start <= end <= len(data):
             raise self.fault(f"got {len(data)} bytes for accessor {number}, expected {end}; it is damaged: export it again")
@@ -153,12 +162,21 @@ def open_gltf(path: Path) -> Container:
     """Read the JSON of a .glb (known by its first four bytes) or a .gltf.
 
     Raises:
-      UserError: the file is shorter than its header says. What else pygltflib meets it raises as it likes.
+      UserError: the file is shorter than its header says, or of another version. What else it meets is raised as it comes.
     """
     data = path.read_bytes()
     if data[:4] != b"glTF":
-        return Container(path, pygltflib.GLTF2.from_json(data.decode("utf-8"), infer_missing=True))
+        return _of_version_2(Container(path, pygltflib.GLTF2.from_json(data.decode("utf-8"), infer_missing=True)))
     _, length = struct.unpack("<4xII", data[:12])
     if length > len(data):
         raise UserError(f"{path.name}: got {len(data)} bytes, expected {length}; the file is cut short: copy it again")
-    return Container(path, pygltflib.GLTF2.load_from_bytes(data))
+    return _of_version_2(Container(path, pygltflib.GLTF2.load_from_bytes(data)))
+
+
+def _of_version_2(file: Container) -> Container:
+    asset = file.json.asset
+    version, least = (str(getattr(asset, name, None) or "2.0") for name in ("version", "minVersion"))
+    if version.partition(".")[0] != "2" or least not in ("2", "2.0"):
+        told = version if version.partition(".")[0] != "2" else f"{version} that asks for {least}"
+        raise file.fault(f"got glTF of version {told}, expected 2.0; export it again as glTF 2.0")
+    return file

@@ -19,6 +19,7 @@ import pygltflib
 from ddprt.axes import Float, Float64, Int
 from ddprt.scene.accessors import Container, open_gltf
 from ddprt.scene.checks import UNSAID, checked
+from ddprt.scene.gltf_cameras import seen_from
 from ddprt.scene.gltf_nodes import Pose, placed
 from ddprt.scene.gltf_primitive import colours_of, triangles_of
 from ddprt.scene.gltf_samplers import wraps
@@ -105,7 +106,7 @@ class Reader:
         materials = tuple(self._material(number) for number in numbers)
         self._lamps()
         still = (("animations", self.file.json.animations), ("skins", self.file.json.skins)) if self.pose is None else ()
-        self.ignored.update(what for what, there in (*still, ("cameras", self.file.json.cameras)) if there)
+        self.ignored.update(what for what, there in still if there)
         materials = tuple(
             self._rolled_out(material, number, [part for part in parts if part.material == number])
             for material, number in zip(materials, numbers, strict=True)
@@ -113,7 +114,7 @@ class Reader:
         colour = np.concatenate([part.colour for part in parts])
         uv = np.concatenate([part.uv for part in parts]) if any(entry.textures for entry in materials) else None
         listed = [f"ignored in the file: {', '.join(sorted(self.ignored))}"] if self.ignored else []
-        return checked(
+        scene = checked(
             self.file.path.stem,
             np.concatenate([part.positions for part in parts]),
             np.concatenate([part.triangles + start for part, start in zip(parts, starts, strict=False)]),
@@ -125,6 +126,7 @@ class Reader:
             lightmap=self._lightmap(parts),
             notes=(*self.notes, *listed),
         )
+        return seen_from(scene, self.file, placed(self.file, self.pose)) if self.file.json.cameras else scene
 
     def positions(self) -> Float64[np.ndarray, "vertices 3"]:
         """All vertices in world space, before any is dropped by the checks, metres."""

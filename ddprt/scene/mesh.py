@@ -13,6 +13,7 @@ import numpy as np
 from ddprt.axes import Float, Float32, Float64, Int, Int32
 from ddprt.scene.fog import Fog
 from ddprt.scene.material import Material, bilinear
+from ddprt.scene.viewpoint import Viewpoint
 
 SIDES = 3
 """Of the prisms that strands are made of."""
@@ -63,6 +64,7 @@ class Scene:
       colour: linear factor on the albedo per vertex, 0 to 1, or None where it is 1 everywhere.
       lightmap: where the file would have each vertex on a lightmap, unchecked; see `ddprt.scene.own_charts`.
       fog: what fills the bounding box; None for clear air.
+      viewpoint: from where its maker would have it seen; None where nobody says. No light depends on it.
       rest: the pose of an animation that this one's lightmap is unwrapped on; None where nothing moves.
     """
 
@@ -82,6 +84,7 @@ class Scene:
     lightmap: Float64[np.ndarray, "vertices 2"] | None = None
     fog: Fog | None = None
     rest: "Scene | None" = None
+    viewpoint: Viewpoint | None = None
 
     @cached_property
     def corners(self) -> Float64[np.ndarray, "triangles 3 3"]:

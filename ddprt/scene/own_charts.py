@@ -82,6 +82,11 @@ def fault_of(scene: Scene, resolution: int, padding: int) -> str:
     return ""
 
 
+def charts_apart(scene: Scene, resolution: int, texels: int) -> bool:
+    """Whether charts of the scene's own layout have so many empty texels between them; its coordinates must be all there."""
+    return _gap(*own_charts(scene), resolution, texels) >= texels
+
+
 def own_charts(scene: Scene) -> tuple[Float64[np.ndarray, "triangles 3 2"], Int32[np.ndarray, " triangles"]]:
     """Corners of the scene's own layout in the unit square, origin top-left, and the chart of each triangle.
 

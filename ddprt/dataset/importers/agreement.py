@@ -35,8 +35,14 @@ def told(
     position, normal = (getattr(places, name)[texel].astype(np.float64) for name in ("position", "normal"))
     traced = np.stack([measure(tracer, lighting, position, normal, seed=0) for lighting in lightings]).astype(np.float64)
     given = direct[:, texel].astype(np.float64)
-    if not traced.any() or not given.any():
-        return "direct light traced again: dark, so it tells nothing", not (traced.any() or given.any())
+    if not traced.any() and not given.any():
+        return "direct light traced again: dark, as imported, so it tells nothing", True
+    if not given.any() or not traced.any():
+        dark, lit = ("imported", "traced again") if traced.any() else ("traced again", "imported")
+        words = f"direct light is dark as {dark}, and is not as {lit}, at {len(texel)} texels of {len(lightings)} lightings"
+        upside = not given.any() and _correlation(turned[:, texel].astype(np.float64), traced) > _ALIKE
+        look = "they look upside down: row 0 of a map is its top" if upside else "look at the lights, the axes and the way up"
+        return f"{words}; {look}", False
     ratio, alike = float(given.sum() / traced.sum()), _correlation(given, traced)
     words = f"direct light traced again at {len(texel)} texels of {len(lightings)} lightings: imported / traced {ratio:.3f}"
     words += f", correlation {alike:.3f}"

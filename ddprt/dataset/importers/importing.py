@@ -75,9 +75,19 @@ class _Import:
     notes: list[str] = field(default_factory=list)
 
     def run(self, source: str) -> Dataset:
-        shape, lit, quantity = self._judge()
+        shape, lit, quantity, glow = self._judge()
+        for line in self.shots.notes:
+            self._doubt(line)
         self._note(f"quantity: {quantity.told}")
         places = freed(find_places(self.recipe, self.folder, shape, lit), quantity, self.notes)
+        if not glow[places.covered].any():
+            turned = "; they look upside down: row 0 of a map is its top" if glow[::-1][places.covered].any() else ""
+            raise UserError(
+                f"--indirect: got maps that are black at all {len(places.area)} texels that count, expected light to learn; "
+                f"look at the mask, the lightmap coordinates and the way up{turned}"
+            )
+        for line in places.notes:
+            self._doubt(line)
         chosen, samples, corners, why = self._points(places)
         self._note(f"{len(places.area)} texels of {shape[1]} x {shape[0]}, {len(samples.position)} measured values each")
         unknown = [name for name in ("position", "area", "albedo", "mesh") if name not in places.known]
@@ -98,21 +108,28 @@ class _Import:
         self.notes.append(line)
         self.progress.say(line)
 
-    def _judge(self) -> tuple[tuple[int, int], np.ndarray, Quantity]:
-        """Reads every picture once: size, colour, sign, what it holds, and which texels are ever lit."""
+    def _doubt(self, line: str) -> None:
+        self.notes.append(line)
+        self.progress.warn(line)
+
+    def _judge(self) -> tuple[tuple[int, int], np.ndarray, Quantity, np.ndarray]:
+        """Reads every picture once: size, colour, sign, what it holds, which texels are ever lit, which indirectly."""
         first: Picture | None = None
         colours, quantities, lit, dark, coarse = set[str](), set[str](), np.zeros((0, 0), bool), 0, False
         alpha: np.ndarray | None = None
+        glow = lit
         with self.progress.stage("read", len(self.shots.files)) as stage:
             for kind, path in self._all():
                 picture = read_picture(path, self._wanted(kind))
                 if first is None:
                     first, lit = picture, np.zeros(picture.light.shape[:2], bool)
+                    glow = lit.copy()
                 if picture.light.shape[:2] != lit.shape:
                     got, expected = (f"{shape[1]} x {shape[0]}" for shape in (picture.light.shape, lit.shape))
                     raise UserError(f"{path}: got {got} pixels, expected {expected} as the first picture; make all of one size")
                 light = self._positive(path, picture)
                 lit |= light.max(2) > 0
+                glow |= (light.max(2) > 0) & (kind == "indirect")
                 if picture.alpha is not None:
                     alpha = picture.alpha > 0 if alpha is None else alpha | (picture.alpha > 0)
                 dark += kind == "indirect" and not light.any()
@@ -128,7 +145,8 @@ class _Import:
             self.progress.warn("pictures of 8 bits a channel are taken as sRGB: dark places are coarse, bright ones cut off")
         if dark:
             self.progress.warn(f"{dark} of {len(self.shots.indirect)} pictures are black")
-        return lit.shape, lit if alpha is None or not alpha.any() else alpha, self._quantity(quantities)
+        counts = lit if alpha is None or not alpha.any() else alpha
+        return lit.shape, counts, self._quantity(quantities), glow
 
     def _quantity(self, said: set[str]) -> Quantity:
         if self.recipe.quantity != "auto":

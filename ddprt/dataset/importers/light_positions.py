@@ -25,18 +25,19 @@ def read_lp(path: Path) -> list[tuple[Path, Lighting]]:
     """Photographs and their lights, of irradiance 1 W/m² each.
 
     Raises:
-      UserError: missing, cut short, a line that is none, or a photograph that is not there.
+      UserError: missing, cut short, a line that is none, or a photograph that is not there or there twice.
     """
     try:
-        lines = [line.strip() for line in path.read_text("utf-8-sig").splitlines() if line.strip()]
+        text = path.read_text("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{path}: got {error}, expected a readable .lp file; check the path") from None
-    if not lines or not lines[0].isdigit():
-        raise UserError(f'{path}: got "{(lines or [""])[0][:40]}" first, expected the number of photographs; mend the file')
-    if int(lines[0]) != len(lines) - 1:
-        raise UserError(f"{path}: got {len(lines) - 1} lines for {lines[0]} photographs, expected as many; mend the file")
+    (_, first), *lines = [(number, line.strip()) for number, line in enumerate(text, 1) if line.strip()] or [(1, "")]
+    if not first.isdigit():
+        raise UserError(f'{path}: got "{first[:40]}" first, expected the number of photographs; mend the file')
+    if int(first) != len(lines):
+        raise UserError(f"{path}: got {len(lines)} lines for {first} photographs, expected as many; mend the file")
     found: list[tuple[Path, Lighting]] = []
-    for number, line in enumerate(lines[1:], 1):
+    for number, line in lines:
         name, *words = line.rsplit(None, 3)
         try:
             x, y, z = (float(word) for word in words)
@@ -49,6 +50,8 @@ def read_lp(path: Path) -> list[tuple[Path, Lighting]]:
         photo = path.parent / name.replace("\\", "/")
         if not photo.is_file():
             raise UserError(f"{path}: got {name} in line {number}, which is not there, expected it at {photo}; copy it there")
+        if any(photo == known for known, _ in found):
+            raise UserError(f"{path}: got {name} again in line {number}, expected each photograph once; mend the file")
         light = DirectionalLight(direction=(-x, -y, -z), irradiance=(1.0, 1.0, 1.0))
         found.append((photo, (light,)))
     return found

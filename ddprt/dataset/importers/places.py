@@ -18,6 +18,7 @@ from ddprt.scene.checks import UNSAID
 from ddprt.scene.files import load_lightmapped
 from ddprt.scene.material import Material
 from ddprt.scene.mesh import Scene
+from ddprt.scene.own_charts import charts_apart
 
 _LAPPED = 1.01  # of a texel: more than that of it is covered twice
 
@@ -35,6 +36,7 @@ class Places:
       corners: triangles that cast shadows, metres; none where there is no mesh.
       uv: their lightmap coordinates; None likewise.
       known: what is known: "position", "area", "albedo", "mesh".
+      notes: what is to be told of them, a line each.
     """
 
     covered: Bool[np.ndarray, "height width"]
@@ -46,6 +48,7 @@ class Places:
     corners: Float64[np.ndarray, "triangles 3 3"]
     uv: Float64[np.ndarray, "triangles 3 2"] | None
     known: frozenset[str]
+    notes: tuple[str, ...] = ()
 
     def kept(self, texels: Bool[np.ndarray, " texels"]) -> "Places":
         """Some of the texels."""
@@ -132,7 +135,13 @@ def _on_mesh(recipe: Recipe, folder: Path, shape: tuple[int, int]) -> Places:
         name: np.asarray(getattr(atlas, name), np.float32) for name in ("position", "normal", "albedo", "area", "coverage")
     }
     known = frozenset(("position", "area", "mesh", "albedo"))
-    return Places(atlas.slot >= 0, **single, corners=scene.corners, uv=uv, known=known)
+    # Light is looked up between texels: where charts touch, that of one shows on the other.
+    apart = charts_apart(scene, shape[0], 1)
+    bleeds = (
+        f"charts of {recipe.geometry} are not one texel apart at this size: light bleeds over their edges; unwrap with a margin"
+    )
+    notes = () if apart else (bleeds,)
+    return Places(atlas.slot >= 0, **single, corners=scene.corners, uv=uv, known=known, notes=notes)
 
 
 def _in_picture(recipe: Recipe, reader: "_Maps", lit: Bool[np.ndarray, "height width"]) -> Places:

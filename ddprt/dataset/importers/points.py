@@ -57,7 +57,9 @@ def choose_points(asked: str, folder: Path, places: Places, seed: int) -> Chosen
 
 def _spread(count: int, places: Places, seed: int) -> Chosen:
     total = len(places.area)
-    if not 0 < count <= total:
+    if count < 1:
+        raise UserError(f"--points: got {count}, expected 1 to {total}, as many as texels count; raise --points")
+    if count > total:
         raise UserError(f"--points: got {count}, but {total} texels count; lower --points")
     rng = seeds.stream(seed, "import points")
     weight = np.cumsum(places.area, dtype=np.float64)

@@ -76,6 +76,8 @@ def load_recipe(source: Path, options: Mapping[str, str]) -> tuple[Recipe, Path,
             known = list(Recipe.model_fields)
             raise UserError(f"{file}: unknown key {key}{nearest(key, known)}; known here: {', '.join(known)}")
     found = {key: value for key, value in _lying(folder, document).items() if key not in document}
+    # What merely lies there gives way to a mesh that was asked for.
+    idle = [found.pop(key) for key in ("position", "normal") if key in found and document.get("geometry")]
     try:
         recipe = Recipe.model_validate({**found, **{key: _value(value) for key, value in document.items()}})
     except ValidationError as error:
@@ -87,7 +89,8 @@ def load_recipe(source: Path, options: Mapping[str, str]) -> tuple[Recipe, Path,
         SPACES[recipe.colour]
     if recipe.test + recipe.validation >= 1:
         raise UserError(f"--test: got {recipe.test:g} and {recipe.validation:g}, expected a sum below 1; lower one")
-    return recipe, folder, [f"{key}: {value}" for key, value in found.items()]
+    told = [f"{', '.join(idle)}: left aside for the mesh of --geometry"] if idle else []
+    return recipe, folder, [*(f"{key}: {value}" for key, value in found.items()), *told]
 
 
 def _value(text: Any) -> Any:

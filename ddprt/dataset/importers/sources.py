@@ -32,6 +32,7 @@ class Shots:
       measured: values, where they are given.
       lightings: lights; () where they are not known.
       splits: "train", "validation" or "test".
+      notes: what is to be told of them, a line each.
     """
 
     kind: str
@@ -41,6 +42,7 @@ class Shots:
     measured: Float32[np.ndarray, "lightings points 3"] | None
     lightings: tuple[Lighting, ...]
     splits: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -73,8 +75,8 @@ def _pairs(recipe: Recipe, folder: Path) -> Shots:
     direct, indirect = by_key(folder, recipe.direct, "--direct"), by_key(folder, recipe.indirect, "--indirect")
     paired(direct, indirect)
     keys = tuple(indirect)
-    lightings, splits = _lit(recipe, folder, keys)
-    return Shots("pairs", keys, tuple(indirect.values()), tuple(direct[key] for key in keys), None, lightings, splits)
+    lightings, splits, notes = _lit(recipe, folder, keys)
+    return Shots("pairs", keys, tuple(indirect.values()), tuple(direct[key] for key in keys), None, lightings, splits, notes)
 
 
 def _vectors(recipe: Recipe, folder: Path) -> Shots:
@@ -89,9 +91,9 @@ def _vectors(recipe: Recipe, folder: Path) -> Shots:
     direct = by_key(folder, recipe.direct, "--direct") if recipe.direct else None
     if direct is not None:
         paired(direct, indirect)
-    lightings, splits = _lit(recipe, folder, keys)
+    lightings, splits, notes = _lit(recipe, folder, keys)
     maps = None if direct is None else tuple(direct[key] for key in keys)
-    return Shots("vectors", keys, tuple(indirect.values()), maps, values, lightings, splits)
+    return Shots("vectors", keys, tuple(indirect.values()), maps, values, lightings, splits, notes)
 
 
 def _photographs(recipe: Recipe, folder: Path) -> Shots:
@@ -112,10 +114,14 @@ SOURCES: Catalogue[Callable[[Recipe, Path], Shots]] = Catalogue(
 """What each makes of a recipe and its folder."""
 
 
-def _lit(recipe: Recipe, folder: Path, keys: Sequence[str]) -> tuple[tuple[Lighting, ...], tuple[str, ...]]:
+def _lit(recipe: Recipe, folder: Path, keys: Sequence[str]) -> tuple[tuple[Lighting, ...], tuple[str, ...], tuple[str, ...]]:
+    """Lights and split of each picture, and what to note of the table."""
     if not recipe.lights:
-        return ((),) * len(keys), _dealt(recipe, len(keys))
-    rows = match(read_table(folder / recipe.lights), keys, recipe.lights)
+        return ((),) * len(keys), _dealt(recipe, len(keys)), ()
+    table = read_table(folder / recipe.lights)
+    rows = match(table, keys, recipe.lights)
+    idle = [row.name for row in table if row.name and row.name not in keys]
+    notes = (f'{recipe.lights}: {len(idle)} lightings name no picture and are left out, the first "{idle[0]}"',) if idle else ()
     if not rows[0].split:
         splits = _dealt(recipe, len(keys))
     else:
@@ -123,7 +129,7 @@ def _lit(recipe: Recipe, folder: Path, keys: Sequence[str]) -> tuple[tuple[Light
         lacks = [name for name in ("train", "validation", "test") if name not in splits]
         if lacks:
             raise UserError(f"{recipe.lights}: got no lighting for {lacks[0]}, expected one at least; mend the column split")
-    return tuple(row.lighting for row in rows), splits
+    return tuple(row.lighting for row in rows), splits, notes
 
 
 def _dealt(recipe: Recipe, count: int) -> tuple[str, ...]:

@@ -65,9 +65,12 @@ def pack(model: Model, data: Dataset | None = None, *, stitch: bool = True) -> d
     if not isinstance(model.relighter, LinearTransfer):
         raise UserError(f'view: got a model of method "{model.method}", expected svd-ridge; set fit.method = "svd-ridge"')
     if model.uv is None:
-        raise UserError("view: got a model of an older version, without lightmap coordinates; bake and fit again")
+        raise UserError(
+            "view: got a model without lightmap coordinates, as of an import without a mesh, or of an older version; import "
+            "again with --geometry MESH, or bake and fit again"
+        )
     tracer = Tracer(model.occluders, holes=model.holes, fog=model.fog)
-    camera = camera_for(model.scene["name"], model.occluders)
+    camera = camera_for(model.scene["name"], model.occluders, model.viewpoint)
     with tempfile.TemporaryDirectory() as folder:
         export_textures(model, folder, gutter=GUTTER, stitch=stitch)
         found = _exported(Path(folder))
