@@ -22,6 +22,7 @@ from ddprt.export.engines.packed import Packed
 from ddprt.export.golden import example_values
 from ddprt.runtime.model import Model
 from ddprt.sampling.points import Samples
+from ddprt.scene.fog import Fog
 from ddprt.sections import ExportConfig
 
 COMPILER = shutil.which("gcc") or shutil.which("clang")
@@ -223,3 +224,13 @@ def test_what_takes_more_than_a_matrix_is_refused(kind: str, tmp_path: Path) -> 
     with pytest.raises(UserError, match=r"export\.engines: got made-up, whose frames take more than a matrix"):
         export_model(model_of(relighters(3, 3)[kind]), tmp_path, engines=["c"])
     assert not any(tmp_path.iterdir())
+
+
+def test_engines_are_told_of_fog(tmp_path: Path) -> None:
+    model = model_of(relighters(3, 3)["plain"])
+    for fog, told in ((None, False), (Fog((1.5, 2.0, 3.0)), True)):
+        export_model(replace(model, fog=fog), tmp_path, engines=list(ENGINES))
+        for name in ENGINES:
+            text = (tmp_path / name / "README.md").read_text("utf-8")
+            assert ("**Fog.**" in text) == told
+            assert ("1.5, 2, 3" in text) == told

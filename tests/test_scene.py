@@ -277,7 +277,7 @@ PICTURE = Material("a", (0.5, 0.5, 0.5), np.ones((2, 2, 3)))
         ({"materials": ()}, "material index 0"),
         ({"material": np.array([0, 1])}, "material index 1"),
         ({"material": np.array([0])}, "materials of shape"),
-        ({"materials": (PICTURE,)}, "no texture coordinates"),
+        ({"materials": (PICTURE,)}, "expected texture coordinates too"),
         ({"materials": (PICTURE,), "uv": np.full((4, 2), np.inf)}, "texture coordinate is not finite"),
         ({"materials": (PICTURE,), "uv": np.zeros((3, 2))}, r"uv of shape \(3, 2\), expected \(4, 2\)"),
         ({"materials": (Material("a", (1.0, 1.0, 1.0), np.full((2, 2, 3), 1.5)),), "uv": np.zeros((4, 2))}, "values 0 to 1"),

@@ -9,6 +9,7 @@ import numpy as np
 
 from ddprt import __version__
 from ddprt.errors import UserError
+from ddprt.export import fog
 from ddprt.export.engines.packed import FORMAT
 from ddprt.export.engines.writing import check_engines, export_engines
 from ddprt.export.frame import Frames
@@ -88,7 +89,7 @@ def export_model(
         document = golden(model, found, Frames.read(folder), folder)
         write_text(folder / GOLDEN, json.dumps(document, allow_nan=False) + "\n")
         written.append(folder / GOLDEN)
-    written += export_engines(folder, engines, model.covered, example_values(model))
+    written += export_engines(folder, engines, model.covered, example_values(model), fog.notes(model))
     return [*written, path]
 
 

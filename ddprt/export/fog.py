@@ -16,3 +16,15 @@ def told(model: Model) -> dict[str, Any]:
         return {}
     corners = model.occluders.reshape(-1, 3)
     return {"fog": {**model.fog.record, "low": corners.min(0).tolist(), "high": corners.max(0).tolist()}}
+
+
+def notes(model: Model) -> list[str]:
+    """The same for whoever reads one engine's README alone."""
+    if not (fog := told(model).get("fog")):
+        return []
+    path, low, high = (", ".join(f"{value:.6g}" for value in fog[key]) for key in ("mean_free_path", "low", "high"))
+    return [
+        f"**Fog.** This model was learned in fog, which fills the box from ({low}) to ({high}) metres. Wherever direct light\n"
+        "is shaded, at samples and on surfaces, multiply what a lamp sends by exp(-length / mean free path) per channel: the\n"
+        f"length of its way through the box in metres, mean free paths of red, green and blue {path}. The lightmap knows the fog."
+    ]

@@ -216,9 +216,10 @@ def _reflects(name: str, material: Material, uv: np.ndarray | None) -> None:
         if not sound or not ((image >= 0) & (image <= 1)).all():
             shape = ", ".join(["height", "width", *map(str, channels)])
             texture = "texture" if what == "albedo" else f"texture of {what}"
-            raise UserError(f"{name}: got a {texture} {of} that is not ({shape}) with values 0 to 1; correct it")
+            fault = "with values outside of 0 to 1" if sound else f"of shape {image.shape}"
+            raise UserError(f"{name}: got a {texture} {of} {fault}, expected ({shape}) with values 0 to 1; correct it")
         if uv is None:
-            raise UserError(f"{name}: got a texture {of} but no texture coordinates; unwrap it or drop the texture")
+            raise UserError(f"{name}: got a texture {of}, expected texture coordinates too; unwrap it or drop the texture")
     radiance = np.asarray(material.emission.radiance if material.emission else (0, 0, 0), np.float64)
     if radiance.shape != (3,) or not ((radiance >= 0) & (radiance <= BRIGHTEST)).all():
         raise UserError(f"{name}: got radiance {radiance.tolist()} {of}, expected three numbers 0 to {BRIGHTEST:g}; correct it")

@@ -15,7 +15,7 @@ from ddprt.export.engines.packed import Packed
 from ddprt.files import make_folder, write_text, written_whole
 from ddprt.runtime.deployment import Deployment
 
-MODEL, GOLDEN, NUMBERS = "model.bin", "golden.json", "golden.txt"
+MODEL, GOLDEN, NUMBERS, README = "model.bin", "golden.json", "golden.txt", "README.md"
 TEXELS = 5
 
 
@@ -33,7 +33,11 @@ def check_engines(found: Deployment, method: str) -> None:
 
 
 def export_engines(
-    folder: Path, names: Sequence[str], covered: Bool[np.ndarray, "height width"], values: Float[np.ndarray, "points 3"]
+    folder: Path,
+    names: Sequence[str],
+    covered: Bool[np.ndarray, "height width"],
+    values: Float[np.ndarray, "points 3"],
+    notes: Sequence[str] = (),
 ) -> list[Path]:
     """Writes a folder for each engine into an export that has the format of `packed.FORMAT`; others that were there go.
 
@@ -42,6 +46,7 @@ def export_engines(
       names: of `ENGINES`.
       covered: texels that light is known of.
       values: measured light for the golden numbers, W/m².
+      notes: what else each engine is to heed, a paragraph each, for the end of its README.
     Returns:
       The files.
     Raises:
@@ -62,6 +67,7 @@ def export_engines(
             GOLDEN: json.dumps(document, allow_nan=False) + "\n",
             NUMBERS: _as_text(document),
         }
+        texts[README] = "\n".join([texts[README], *(f"{note}\n" for note in notes)])
         for file, text in texts.items():
             write_text(place / file, text)
         with written_whole(place / MODEL) as temporary:
