@@ -26,5 +26,6 @@ def notes(model: Model) -> list[str]:
     return [
         f"**Fog.** This model was learned in fog, which fills the box from ({low}) to ({high}) metres. Wherever direct light\n"
         "is shaded, at samples and on surfaces, multiply what a lamp sends by exp(-length / mean free path) per channel: the\n"
-        f"length of its way through the box in metres, mean free paths of red, green and blue {path}. The lightmap knows the fog."
+        f"length of its way through the box in metres, mean free paths of red, green and blue {path}.\n"
+        "The lightmap knows the fog."
     ]
