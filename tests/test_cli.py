@@ -491,7 +491,7 @@ def test_an_interrupt_that_a_callback_drops_comes_again(monkeypatch: pytest.Monk
         try:
             gc.collect()
             assert not raised
-            threading.Event().wait(5)  # a wait that only a signal ends early
+            threading.Event().wait(60)  # a wait that only a signal ends early
             raise AssertionError("no interrupt came")
         finally:
             gc.callbacks.remove(callback)
@@ -505,7 +505,7 @@ def test_an_interrupt_that_a_callback_drops_comes_again(monkeypatch: pytest.Monk
     finally:
         signal.signal(signal.SIGINT, as_before)
     assert end.value.code == 130
-    assert time.perf_counter() - begun < 4, "the wait was woken"
+    assert time.perf_counter() - begun < 40, "the wait was woken"
     assert "goes on from there" in capsys.readouterr().err
     assert ignored == [ValueError]
 
