@@ -304,7 +304,7 @@ def test_a_model_file_carries_the_coordinates(model: Model, atlas: Atlas, tmp_pa
 
 
 def test_export_says_why_it_did_not_stitch(model: Model, tmp_path: Path) -> None:
-    for old, gutter, why in ((model, 0, "export.gutter is 0"), (replace(model, uv=None), 4, "bake and fit again")):
+    for old, gutter, why in ((model, 0, "export.gutter is 0"), (replace(model, uv=None), 4, "imported without a mesh")):
         export_textures(old, tmp_path, gutter=gutter)
         seams = json.loads((tmp_path / "manifest.json").read_text())["seams"]
         assert not seams["stitched"]
