@@ -24,7 +24,7 @@ from ddprt.export.viewer.pack import pack
 from ddprt.files import read_tensors, write_tensors
 from ddprt.lights import parse_lighting
 from ddprt.pipeline_animation import AnimatedRun
-from ddprt.pipeline_inspect import describe
+from ddprt.pipeline_inspect import examine
 from ddprt.report.animated import at_pose, maps, noise, picture, poses, score, table
 from ddprt.runtime.animated import AnimatedModel
 from ddprt.runtime.animated_file import load_animated
@@ -487,7 +487,7 @@ def test_what_an_animation_leaves_out_is_told(tmp_path: Path, capsys: pytest.Cap
     AnimatedRun(config, tmp_path, quiet=False).fit(data)
     assert "methods.compare: mean, mlp left out: with an animation" in capsys.readouterr().err
     (tmp_path / "arm.toml").write_text(job(animation={"keys": [0.0, 0.5, 0.75]}).to_toml())
-    words = describe(str(tmp_path / "arm.toml"), {})
+    words = examine(str(tmp_path / "arm.toml"), {}).text
     assert "animation   3 keyframes, at 0, 0.5, 0.75 s, each with a bake as below" in words
     assert "2 poses between with 5 lightings each" in words
 

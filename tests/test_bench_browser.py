@@ -35,7 +35,6 @@ setTimeout(() => {
   report.pointed = count('a[data-index="3"].pointed');
   mark.dispatchEvent(new PointerEvent("pointerleave"));
   report.left = document.getElementById("tip").hidden;
-  mark.dispatchEvent(new MouseEvent("click", { bubbles: true, cancelable: true }));
   document.querySelector('button[data-knob="fit.bases"]').click();
   report.rows = [...document.querySelectorAll("#settings-table tbody")].filter((row) => !row.hidden).length;
   report.faded = plot(0).querySelectorAll("a.faded").length;
@@ -52,17 +51,22 @@ setTimeout(() => {
   document.querySelectorAll("#settings-table thead button")[6].click();
   const bake = (body) => Number(body.rows[0].cells[6].dataset.value);
   report.sorted = [...document.querySelectorAll("#settings-table tbody")].map(bake);
-  setTimeout(() => {
+  plot(0).querySelector('a[data-index="3"]').dispatchEvent(new MouseEvent("click", { bubbles: true, cancelable: true }));
+  let looks = 0;
+  const look = () => {
+    const place = document.querySelector("tbody.pinned")?.getBoundingClientRect();
+    const seen = place && place.top >= 0 && place.top < window.innerHeight;
+    if (!seen && (looks += 1) < 10) return setTimeout(look, 300); // a busy browser scrolls when it gets round to it
     report.hash = location.hash;
     report.pinned = count('a[data-index="3"].pinned');
     report.row = document.querySelector("tbody.pinned").id;
-    const box = document.querySelector("tbody.pinned").getBoundingClientRect();
-    report.seen = box.top >= 0 && box.top < window.innerHeight;
+    report.seen = seen;
     const node = document.createElement("p");
     node.id = "probe";
     node.textContent = JSON.stringify(report);
     document.body.append(node);
-  }, 300);
+  };
+  setTimeout(look, 300);
 }, 300);
 </script></body>"""
 

@@ -49,8 +49,8 @@ def fitted(parts: tuple[Examples, Examples, Examples]) -> SetEncoder:
 @pytest.fixture(scope="module")
 def bent() -> tuple[SetEncoder, Examples]:
     """One whose network has something to say."""
-    train, held, test = (examples(seed, count, bend=0.5) for seed, count in ((1, 400), (2, 100), (3, 100)))
-    settings = {**SETTINGS, "bases": 12, "steps": 300, "learning_rate": 2e-3, "width": 64, "keep": 0.9}
+    train, held, test = (examples(seed, count, bend=2.0) for seed, count in ((1, 400), (2, 100), (3, 100)))
+    settings = {**SETTINGS, "bases": 12, "steps": 300, "learning_rate": 5e-4, "width": 64, "keep": 0.9}
     return PointSet(**settings).fit(train, held, key=KEY), test
 
 
@@ -111,7 +111,8 @@ def test_points_nearby_stand_in(fitted: SetEncoder, parts: tuple[Examples, Examp
 def test_a_network_that_is_worth_something_is_taken(bent: tuple[SetEncoder, Examples]) -> None:
     encoder, test = bent
     assert encoder.gates[0] > 0.1
-    assert error(encoder, test) < error(replace(encoder, gates=jnp.zeros(2)), test)
+    # Of squares that are most of the light, 400 lightings teach little: 0.4 %. Slopes that mislead would cost as much.
+    assert float(error(encoder, test)) < 0.998 * float(error(replace(encoder, gates=jnp.zeros(2)), test))
 
 
 @pytest.fixture(scope="module")
