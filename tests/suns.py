@@ -7,12 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pytest
 from hard_arrays import Arrays
 
 import ddprt
 from ddprt.dataset.store import Dataset
 from ddprt.lights import DirectionalLight, Lighting, lighting_json
 from ddprt.methods import METHODS
+from ddprt.methods.learned import Learned
 from ddprt.methods.method import AsksForLights
 from ddprt.runtime.model import Model
 
@@ -24,6 +26,14 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "light-network": {"features": 16, "length": 1.0, "steps": 100, "space": "linear"},
     "point-set": {"steps": 100, "width": 16},
 }
+
+
+def _slow(method: str) -> bool:
+    return issubclass(METHODS[method], Learned) and method != "mlp"
+
+
+ALL_METHODS = [pytest.param(name, marks=[pytest.mark.slow] if _slow(name) else []) for name in sorted(METHODS)]
+"""For laws that no method has code of its own for: of those that are trained, which takes seconds, one is in the fast suite."""
 
 
 def asks(method: str) -> bool:

@@ -91,14 +91,17 @@ def in_a_process(*words: str) -> dict[str, Any]:
     return json.loads(answer.stdout.splitlines()[-1])
 
 
-def test_what_is_left_out_is_not_imported_compiled_or_traced_and_changes_no_bit() -> None:
+@pytest.mark.parametrize("every", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_what_is_left_out_is_not_imported_compiled_or_traced_and_changes_no_bit(every: bool) -> None:
     """Each library scene is baked while files of effects that it does not call for raise on import, then with all imported.
 
-    Scenes with fewer effects come first, since what is once imported stays. That a scene calls for the effects of an entry
-    tells nothing of lights, which all live in `lights` and are imported always.
+    The fast suite has one scene for each set of effects. Scenes with fewer effects come first, since what is once imported
+    stays. That a scene calls for the effects of an entry tells nothing of lights, which all live in `lights` and are
+    imported always.
     """
     called = {name: {entry.module for key, entry in EFFECTS.items() if plan(build(name), ()).called(key)} for name in SCENES}
-    names = sorted(SCENES, key=lambda name: len(called[name]))
+    some = SCENES if every else {frozenset(modules): name for name, modules in reversed(called.items())}.values()
+    names = sorted(some, key=lambda name: len(called[name]))
     with ThreadPoolExecutor(2) as pool:
         apart, together = pool.map(lambda way: in_a_process(way, *names), ("apart", "together"))
     assert apart["early"] == [], "importing the bake imports files of effects"

@@ -100,7 +100,7 @@ def _survivors(patch: pytest.MonkeyPatch, factor: float, *, slow: bool) -> set[s
 
 
 @pytest.mark.parametrize("slow", [pytest.param(False, id="fast"), pytest.param(True, marks=pytest.mark.slow, id="slow")])
-@pytest.mark.parametrize("factor", [0.0, 1.01])
+@pytest.mark.parametrize("factor", [pytest.param(0.0, marks=pytest.mark.slow), 1.01])
 def test_a_wrong_matrix_fails_nearly_all(monkeypatch: pytest.MonkeyPatch, factor: float, slow: bool) -> None:
     """A package whose transfer is nothing, or off by a hundredth, holds in no case but those that say why."""
     expected = {case.name for case in OF_TRANSFER if case.slow == slow} & set(NO_MATTER)

@@ -6,12 +6,11 @@ import suns
 from hard_arrays import TEST, TRAIN, VALIDATION, make_data, room
 
 from ddprt.dataset.store import average_into_points
-from ddprt.methods import METHODS
 from ddprt.report.evaluate import evaluate
 from ddprt.sampling.points import Samples
 
 HELD_BACK = slice(TRAIN, TRAIN + VALIDATION)
-METHOD = pytest.mark.parametrize("method", sorted(METHODS))
+METHOD = pytest.mark.parametrize("method", suns.ALL_METHODS)
 
 
 def status(measured: np.ndarray, indirect: np.ndarray, method: str = "svd-ridge") -> str:

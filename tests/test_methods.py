@@ -31,8 +31,9 @@ EPS32 = float(np.finfo(np.float32).eps)
 
 
 def case(method: str, variant: str) -> object:
-    """Training takes seconds: of methods that are trained, one variant is in the fast suite."""
-    long = issubclass(METHODS[method], Learned) and variant != "plain"
+    """Training takes seconds: of methods that are trained, one variant is in the fast suite, of others but the baseline two."""
+    few = {"plain"} if issubclass(METHODS[method], Learned) else {"plain", "mean gamma multi"}
+    long = method != "svd-ridge" and variant not in few
     return pytest.param((method, variant), id=f"{method}-{variant}", marks=[pytest.mark.slow] if long else [])
 
 

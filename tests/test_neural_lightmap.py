@@ -70,7 +70,10 @@ def _growth(found: NeuralLightmap, frame: Any) -> float:
     return float(jnp.max(jnp.abs(sizes.predict(frame))) / jnp.max(jnp.abs(found.predict(frame))))
 
 
-@pytest.mark.parametrize(("light", "channels"), [("last", "mono"), ("everywhere", "mono"), ("everywhere", "multi")])
+@pytest.mark.parametrize(
+    ("light", "channels"),
+    [pytest.param("last", "mono", marks=pytest.mark.slow), ("everywhere", "mono"), ("everywhere", "multi")],
+)
 def test_a_shader_in_loops_gives_the_same_and_does_what_is_counted(light: str, channels: str) -> None:
     """A slow twin in float64, one texel and one multiply-add after the other."""
     train = replace(examples(1, 12, points=5, texels=7), channels=channels)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from suns import sun_of
+from suns import ALL_METHODS, sun_of
 
 from ddprt.errors import UserError
 from ddprt.fitting.selection import SECOND_OPINION, TWINS, Choice, choose_ridge, decompose, left_out
@@ -421,12 +421,12 @@ def test_second_opinion_is_asked() -> None:
     assert SECOND_OPINION > 1
 
 
-def test_methods_all_know_the_statuses() -> None:
+@pytest.mark.parametrize("method", ALL_METHODS)
+def test_methods_all_know_the_statuses(method: str) -> None:
     X, Y = room()
-    for method in METHODS:
-        known = METHODS[method].model_fields
-        settings = {key: value for key, value in {"steps": 5, "check_every": 5, "width": 4}.items() if key in known}
-        assert report(pairs(X * 0, Y), method, **settings).status == "no_signal"
-        assert report(pairs(X, Y * 0), method, **settings).status == "no_signal"
-        X[3] = 0
-        assert "blind" in report(pairs(X, Y), method, **settings).remarks
+    known = METHODS[method].model_fields
+    settings = {key: value for key, value in {"steps": 5, "check_every": 5, "width": 4}.items() if key in known}
+    assert report(pairs(X * 0, Y), method, **settings).status == "no_signal"
+    assert report(pairs(X, Y * 0), method, **settings).status == "no_signal"
+    X[3] = 0
+    assert "blind" in report(pairs(X, Y), method, **settings).remarks

@@ -20,7 +20,6 @@ from ddprt.export.textures import export_textures
 from ddprt.fitting.encoding import Encoding
 from ddprt.fitting.selection import decompose
 from ddprt.lights import PointLight
-from ddprt.methods import METHODS
 from ddprt.methods.method import STATUSES, Examples, Frame
 from ddprt.report.evaluate import rank_correlation, trust_agreement
 from ddprt.runtime.model import Model
@@ -198,7 +197,7 @@ def test_scaling_the_light_otherwise_changes_rounding_alone(model: Model, values
     assert (np.abs(after.unexplained**2 - square) <= allowed).all()
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", suns.ALL_METHODS)
 def test_every_method_has_trust(name: str, data: Dataset, values: np.ndarray, tmp_path: Path) -> None:
     settings = suns.SETTINGS.get(name)
     model = suns.fit(data, name, settings=settings, **({"bases": 6} if name == "svd-ridge" else {}))
