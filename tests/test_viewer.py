@@ -117,6 +117,16 @@ def test_albedo_is_kept_and_old_models_are_told(model: Model, data: Dataset, tmp
         ddprt.load_model(tmp_path / "odd")
 
 
+def test_black_surfaces_are_told(model: Model) -> None:
+    assert model.albedo is not None
+    assert pack(model)["notes"] == []
+    bare = np.where(np.arange(len(model.albedo))[:, None] % 4 == 0, 0, model.albedo).astype(np.float32)
+    (note,) = pack(replace(model, albedo=bare))["notes"]
+    assert note.startswith("25% of the texels have no diffuse albedo, as bare metal has none")
+    red = np.where(np.arange(3) > 0, 0, model.albedo).astype(np.float32)
+    assert pack(replace(model, albedo=red))["notes"] == []
+
+
 @pytest.fixture(scope="module")
 def saved(model: Model, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("saved") / "model.ddprt"

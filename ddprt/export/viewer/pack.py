@@ -30,6 +30,7 @@ HELD_OUT = 4
 """Lightings that a page holds with their references, at most; 8 bytes a texel each."""
 MOST_LAMPS = 8
 """As in `src/surface.js`."""
+_BLACK = 0.1  # share of texels without albedo that is worth a word
 _BRIGHT = 0.25  # mean radiance, albedo included, that the first lamp is made for
 
 
@@ -222,6 +223,10 @@ def _notes(model: Model) -> list[str]:
     notes = []
     if model.albedo is None:
         notes.append("The model is of an older version, without albedo: surfaces are shown in one grey. Fit it again.")
+    elif (dark := float(np.mean(~model.albedo.any(1)))) > _BLACK:
+        notes.append(
+            f"{dark:.0%} of the texels have no diffuse albedo, as bare metal has none, and are black: show them without albedo."
+        )
     if model.constant is not None:
         notes.append("Surfaces that glow light others; their own radiance is not in the model and is not shown.")
     if model.fog is not None:
