@@ -91,10 +91,12 @@ def relight(call: Call) -> None:
 
 
 def _model_at(call: Call, folder: str | Path) -> Any:
-    """The model of a folder; of what moves, at the time of --time in seconds."""
+    """The model of its folder or of a run's; of what moves, at the time of --time in seconds."""
     from ddprt.runtime.animated_file import is_animated, load_animated
     from ddprt.runtime.model_file import load_model
 
+    within = Path(folder) / "model.ddprt"
+    folder = within if within.is_dir() else folder
     time = call.options.get("time")
     if is_animated(folder) != (time is not None):
         moves = "an animation and no --time, expected seconds" if time is None else "--time and a model that stands still"
@@ -123,8 +125,7 @@ def view(call: Call) -> None:
         raise UserError(f"--port: got {port}, expected a whole number from 0 to 65535; 0 takes a free one")
     if call.asks("time") and call.asks("dataset"):
         raise UserError("--dataset: got one beside --time, expected none: a pose has other texels than its model; leave it out")
-    folder = Path(call.file("a model folder such as runs/cornell/model.ddprt"))
-    model = _model_at(call, folder / "model.ddprt" if (folder / "model.ddprt").is_dir() else folder)
+    model = _model_at(call, call.file("a model folder such as runs/cornell/model.ddprt"))
     data = open_dataset(call.options["dataset"]) if call.asks("dataset") else None
     made = page(pack(model, data))
     if out is None:

@@ -119,7 +119,7 @@ def test_relight(done: Path, tmp_path: Path) -> None:
     assert one.shape == (32, 32, 3)
     assert one.max() > 0
     (tmp_path / "two.json").write_text(json.dumps([[lamp], [{**lamp, "intensity": [2, 2, 2]}]]))
-    assert call("relight", done / "model.ddprt", "--lighting", tmp_path / "two.json", "--out", tmp_path / "two.exr") == 0
+    assert call("relight", done, "--lighting", tmp_path / "two.json", "--out", tmp_path / "two.exr") == 0
     first, second = (read_exr(tmp_path / f"two_00{k}.exr")[0] for k in (0, 1))
     np.testing.assert_array_equal(first, one)
     np.testing.assert_allclose(second, 2 * one, rtol=1e-5, atol=1e-5 * one.max())

@@ -45,22 +45,27 @@ spot_check_samples = 16
 engines = ["c"]
 gltf = true
 """
-PROBE = """const { frame } = window.ddprt, { lamps } = JSON.parse(document.getElementById("asked").textContent);
-const shot = new Image(), canvas = document.createElement("canvas"), node = document.createElement("p");
-window.ddprt.set({ lamps, lighting: null, show: "both", albedo: false });
-const measured = Array.from(frame.measuring.measure(lamps)), { s, z } = frame.transfer.encoded(measured);
-frame.composer.compose(frame.transfer.weights(z), s, 99);
-const map = Array.from(frame.composer.read());
-shot.onload = () => {
-  [canvas.width, canvas.height] = [shot.width, shot.height];
-  canvas.getContext("2d").drawImage(shot, 0, 0);
-  const { data } = canvas.getContext("2d").getImageData(0, 0, shot.width, shot.height);
-  const bright = data.filter((x, i) => i % 4 < 3 && x > 80).length / data.length;
+PROBE = """const { frame, view } = window.ddprt, { lamps } = JSON.parse(document.getElementById("asked").textContent);
+const pixels = (lamps) => new Promise((done) => {
+  window.ddprt.set({ lamps, lighting: null, show: "both", albedo: false });
+  const shot = new Image(), canvas = document.createElement("canvas");
+  shot.onload = () => {
+    [canvas.width, canvas.height] = [shot.width, shot.height];
+    canvas.getContext("2d").drawImage(shot, 0, 0);
+    done(canvas.getContext("2d").getImageData(0, 0, shot.width, shot.height).data);
+  };
+  shot.src = view.screenshot();
+});
+(async () => {
+  const [dark, bright] = [await pixels([]), await pixels(lamps)];
+  const measured = Array.from(frame.measuring.measure(lamps)), { s, z } = frame.transfer.encoded(measured);
+  frame.composer.compose(frame.transfer.weights(z), s, 99);
+  const map = Array.from(frame.composer.read()), node = document.createElement("p");
+  const lit = bright.filter((x, i) => x > dark[i] + 5).length / (0.75 * bright.length);
   node.id = "probe";
-  node.textContent = JSON.stringify({ faults, measured, map, bright });
+  node.textContent = JSON.stringify({ faults, measured, map, lit });
   document.body.append(node);
-};
-shot.src = window.ddprt.view.screenshot();"""
+})();"""
 
 
 def faced(file: File) -> File:
@@ -74,9 +79,9 @@ def faced(file: File) -> File:
     return file
 
 
-def run(path: Path, folder: Path) -> int:
+def run(path: Path, folder: Path, *words: str) -> int:
     (folder / "tiny.toml").write_text(TINY, "utf-8")
-    return call("run", folder / "tiny.toml", "--scene.name", path, "--out", folder / "run")
+    return call("run", folder / "tiny.toml", "--scene.name", path, "--out", folder / "run", *words)
 
 
 @needs_compiler
@@ -99,10 +104,11 @@ def test_from_file_to_browser(name: str, tmp_path: Path) -> None:
     assert call("view", out, "--dataset", out / "dataset", "--html", tmp_path / "a.html") == 0
     middle = (file.corners.min((0, 1)) + file.corners.max((0, 1))) / 2
     middle[2] = file.corners[..., 2].max() + 0.5
-    lamps = [{"type": "point", "position": middle.tolist(), "intensity": [2, 2, 2]}]
+    strength = float(np.sum(np.square(np.ptp(file.corners, (0, 1)))))  # as bright in a long room as in a small one
+    lamps = [{"type": "point", "position": middle.tolist(), "intensity": [strength] * 3}]
     found = browsed((tmp_path / "a.html").read_text("utf-8"), {"lamps": lamps}, PROBE, tmp_path)
     assert found["faults"] == []
-    assert found["bright"] > 0.02, "a picture of something"
+    assert found["lit"] > 0.01, "a picture of something"
     model = ddprt.load_model(out / "model.ddprt")
     values = model.measure(lamps)
     np.testing.assert_allclose(np.reshape(found["measured"], (-1, 3)), values, rtol=2e-4, atol=2e-5 * values.max())
@@ -113,6 +119,8 @@ def test_from_file_to_browser(name: str, tmp_path: Path) -> None:
 
 
 def test_a_lone_rectangle_is_refused_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """It sends nothing back to itself."""
-    assert run(written(FILES["colour factor"](), tmp_path), tmp_path) == 2
-    assert capsys.readouterr().err.splitlines()[-1].startswith("ddprt: export.formats: got a model without any light")
+    """It sends nothing back to itself, and has no room inside."""
+    path = written(FILES["colour factor"](), tmp_path)
+    for distribution, said in (("around", "export.formats: got a model without any light"), ("room", "lightings: got no free")):
+        assert run(path, tmp_path, "--lightings.distribution", distribution) == 2
+        assert capsys.readouterr().err.splitlines()[-1].startswith(f"ddprt: {said}")

@@ -71,7 +71,8 @@ def _clear(source: str | Path, parameters: dict[str, float | int], *, lightmap: 
         why = getattr(error, "strerror", None) or error
         raise UserError(f"{name[:60]}...: got {why}, expected a path; check it") from None
     if not there:
-        raise UserError(f"{path}: got no such file, expected a mesh; check the path")
+        counts = "" if path.is_absolute() else f", which counts from {Path.cwd()}"
+        raise UserError(f"{path}: got no such file, expected a mesh; check the path{counts}")
     if suffix in (".hair", ".strands") and set(parameters) <= {"scale"}:
         from ddprt.scene.tubes import load_hair
 
