@@ -456,7 +456,10 @@ def test_bad_settings(section: dict[str, Any], fault: str) -> None:
         checked({"probes": section})
 
 
-@pytest.mark.parametrize("text", ["[]", "[[1, 2]]", '{"a": 1}', "[[1, 2, 1e99]]", "no", "[[1, 2, NaN]]"])
+@pytest.mark.parametrize(
+    "text",
+    ["[]", "[[1, 2]]", '{"a": 1}', "[[1, 2, 1e99]]", "no", "[[1, 2, NaN]]", "[[0.2, true, 0.3]]", '[["0.2", "0.3", "0.3"]]'],
+)
 def test_bad_files(text: str, tmp_path: Path) -> None:
     path = tmp_path / "probes.json"
     path.write_text(text)
@@ -464,6 +467,13 @@ def test_bad_files(text: str, tmp_path: Path) -> None:
         probes.places(checked({"probes": {"file": str(path)}}).probes, np.array([[0.0] * 3, [1.0] * 3]))
     with pytest.raises(UserError, match=r"probes\.file"):
         probes.places(checked({"probes": {"file": str(tmp_path / "none.json")}}).probes, np.array([[0.0] * 3, [1.0] * 3]))
+
+
+def test_a_bad_file_is_told_before_anything_is_made(cornell: Scene, tmp_path: Path) -> None:
+    (tmp_path / "probes.json").write_text("[[1, 2]]")
+    with pytest.raises(UserError, match=r"probes\.file"):
+        ddprt.bake(cornell, config=job(probes={"grid": [0] * 3, "file": str(tmp_path / "probes.json")}), out=tmp_path / "baked")
+    assert not (tmp_path / "baked").exists()
 
 
 @pytest.mark.parametrize("source", ["grid", "file"])
