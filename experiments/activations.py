@@ -16,6 +16,7 @@ import ddprt
 from ddprt.config import checked
 from ddprt.dataset.store import Dataset
 from ddprt.methods import learned, neural_lightmap
+from ddprt.report.metrics import Truth
 
 SETTINGS = {
     "atlas": {"resolution": 48},
@@ -45,10 +46,9 @@ def bake(scene: str) -> Dataset:
 def error(data: Dataset, method: str, seed: int) -> float:
     """Relative RMSE over held-out lightings."""
     test = data.split("test")
-    truth, weight = data.maps("indirect", test), data.area[:, None]
-    model = ddprt.fit(data, method, seed=seed)
-    missed = model.predict(data.values(test, model.points, "radiosity")) - truth
-    return float(np.sqrt((weight * missed**2).sum() / (weight * truth**2).sum()))
+    truth, model = Truth(data.maps("indirect", test), data.area), ddprt.fit(data, method, seed=seed)
+    missed = model.predict(data.values(test, model.points, "radiosity")) - truth.reference
+    return float(truth.relative_rmse(missed) or 0.0)
 
 
 def main() -> None:

@@ -136,7 +136,7 @@ def main() -> None:
     asked = parser.parse_args()
     asked.folder.mkdir(parents=True, exist_ok=True)
     for strands in asked.strands:
-        scene, progress = build("furball", strands=strands), Progress(quiet=True)
+        scene, progress = build("furball", strands=strands), Progress()
         config, begun = checked(settings(strands, asked.samples, asked.quick)), (time.perf_counter(), time.process_time())
         data = bake(scene, config=config, out=asked.folder / f"hair-{strands}", progress=progress)
         row = {"strands": strands, "texels": len(data.area), "seconds": round(time.perf_counter() - begun[0], 1)}
