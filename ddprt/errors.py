@@ -39,7 +39,9 @@ def explain(faults: Sequence[Mapping[str, Any]], example: Any = None, otherwise:
       example: a good value; shown where a list is asked for, if it is one.
       otherwise: what to do where the faults do not tell.
     """
-    expected = " or ".join(dict.fromkeys(_expected(fault, example) for fault in faults))
+    short = [fault for fault in faults if fault["type"] == "missing" and isinstance(fault["loc"][-1], int)]
+    told = [fault for fault in faults if fault not in short[:-1]]  # the last entry that is missing says how many there must be
+    expected = " or ".join(dict.fromkeys(_expected(fault, example) for fault in told))
     return f"got {_as_json(faults[0]['input'])}, expected {expected}; {_remedy(faults) or otherwise}"
 
 
@@ -56,7 +58,7 @@ def _expected(fault: Mapping[str, Any], example: Any) -> str:
     if kind == "missing" and isinstance(where, int):
         return f"at least {where + 1} entries"
     if kind == "tuple_type":
-        return f"a list such as {_as_json(example)}" if isinstance(example, list | tuple) else "a list"
+        return f"a list such as {_as_json(example)}" if isinstance(example, list | tuple) and example else "a list"
     text = fault["msg"].removeprefix("Input should be ").removeprefix("a valid ")
     return text.removeprefix("Input should have ").split(", unable")[0]
 

@@ -33,7 +33,11 @@ class FogConfig(Section):
     @field_validator("mean_free_path", "albedo", mode="before")
     @classmethod
     def _of_all_channels(cls, value: Any) -> Any:
-        return [value] if isinstance(value, int | float) and not isinstance(value, bool) else value
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            return [value]
+        if not isinstance(value, list | tuple):
+            raise ValueError(f"got {value!r}, expected a number, or one for each of red, green and blue; mend it")
+        return value
 
     @model_validator(mode="after")
     def _is_whole(self) -> "FogConfig":
@@ -59,7 +63,7 @@ class SceneConfig(Section):
 class AnimationConfig(Section):
     """Keyframes of what moves: none unless they are asked for here, or by scene.poses."""
 
-    keys: Annotated[int, Field(ge=0, le=256)] | tuple[float, ...] = Field(
+    keys: Annotated[int, Field(ge=0, le=256)] | Annotated[tuple[float, ...], Field(min_length=1)] = Field(
         0, description="how many, evenly over the motion, or their times in seconds; 0: the scene stands still"
     )
     between: tuple[float, ...] = Field(

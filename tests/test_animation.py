@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,7 @@ from ddprt.scene.library import build
 from ddprt.scene.material import Material
 from ddprt.scene.poses import Animation, load_animation, posed
 from ddprt.scene.shapes import box, faceted, rectangle
+from ddprt.transport.configured import configured_scene
 from ddprt.transport.effects import plan
 from ddprt.transport.embree import Tracer
 from ddprt.transport.measure import measure
@@ -377,6 +379,9 @@ def test_an_export_is_decoded_by_the_documented_steps(
     if way == "glowing":
         glow = np.random.default_rng(1).random((2, len(model.rest.area), 3)).astype(np.float32)
         model = replace(model, constant=glow, rest=replace(model.rest, constant=glow[0]))
+        drawn = np.random.default_rng(2)
+        shifts = {name: 0.1 * drawn.random(getattr(model, name).shape).astype(np.float32) for name in ("offset", "intercept")}
+        model = replace(model, **shifts)  # as where the mean was taken off
     folder, then = tmp_path / "export", tmp_path / "then"
     files = export_animated(model, folder, precision="float", stitch=False)
     assert {path.name for path in files} == {path.name for path in folder.iterdir()}
@@ -439,6 +444,7 @@ def test_what_cannot_follow_a_pose_is_refused(arm: Animation, tmp_path: Path) ->
         bake_animation(arm, [{}], config=job(), out=tmp_path)
     for text, says in (
         ("[animation]\nkeys = -1", "animation.keys"),
+        ("[animation]\nkeys = []", r"animation.keys: got \[\], expected integer"),
         ("[animation]\nbetween = [1.0]", "animation.between"),
         ("[animation]\nbetween = [0, 1]", r"animation.between: got 0, expected shares above 0 and below 1; leave it out"),
         ('[animation]\nmatrices = "some"', "animation.matrices"),
@@ -451,6 +457,16 @@ def test_what_cannot_follow_a_pose_is_refused(arm: Animation, tmp_path: Path) ->
 def test_a_clip_may_be_a_number(tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_text("[animation]\nclip = 1")
     assert load_config(tmp_path / "a.toml").animation.clip == load_config(None, {"animation.clip": "1"}).animation.clip == "1"
+
+
+@pytest.mark.parametrize("setting", [{"clip": "walk"}, {"between": [0.2]}, {"matrices": "one"}])
+def test_a_motion_without_keyframes_is_not_baked_as_a_scene_that_stands_still(setting: dict) -> None:
+    scene = {"name": "bending", "parameters": ARM}
+    says = rf"animation\.keys: got none beside animation\.{next(iter(setting))}, expected how many"
+    with pytest.raises(UserError, match=says):
+        configured_scene(checked({"scene": scene, "animation": setting}))
+    for still in ({**setting, "keys": 0}, {}, tomllib.loads(checked({}).to_toml())["animation"]):
+        assert configured_scene(checked({"scene": scene, "animation": still})).name == "bending"
 
 
 def test_verbs_that_know_no_poses_say_so_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

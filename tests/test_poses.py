@@ -302,7 +302,7 @@ def test_odd_settings_are_no_damage_to_a_file(tmp_path: Path) -> None:
     path = writer.glb(tmp_path / "two.glb")
     assert load_animation(path, clip=1).motion(0.5).tolist() == load_animation(path, clip="1").motion(0.5).tolist()
     assert not np.array_equal(load_animation(path, clip=1).positions, load_animation(path, clip=0).positions)
-    for keys in (2.5, [0.5, np.nan], [np.nan], -1, [[0.0]], []):
+    for keys in (2.5, [0.5, np.nan], [0.0, np.nan, 0.5], [np.nan], -1, [[0.0]], []):
         with pytest.raises(UserError, match=r"animation\.keys: got .*, expected rising seconds from 0 to"):
             load_animation(path, keys=keys)
 

@@ -456,7 +456,10 @@ def test_bad_settings(section: dict[str, Any], fault: str) -> None:
         checked({"probes": section})
 
 
-@pytest.mark.parametrize("text", ["[]", "[[1, 2]]", '{"a": 1}', "[[1, 2, 1e99]]", "no", "[[1, 2, NaN]]"])
+@pytest.mark.parametrize(
+    "text",
+    ["[]", "[[1, 2]]", '{"a": 1}', "[[1, 2, 1e99]]", "no", "[[1, 2, NaN]]", "[[0.2, true, 0.3]]", '[["0.2", "0.3", "0.3"]]'],
+)
 def test_bad_files(text: str, tmp_path: Path) -> None:
     path = tmp_path / "probes.json"
     path.write_text(text)
@@ -464,6 +467,14 @@ def test_bad_files(text: str, tmp_path: Path) -> None:
         probes.places(checked({"probes": {"file": str(path)}}).probes, np.array([[0.0] * 3, [1.0] * 3]))
     with pytest.raises(UserError, match=r"probes\.file"):
         probes.places(checked({"probes": {"file": str(tmp_path / "none.json")}}).probes, np.array([[0.0] * 3, [1.0] * 3]))
+
+
+def test_a_bad_file_is_told_before_anything_is_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "probes.json").write_text("[[1, 2]]")
+    smoke = Path(__file__).parent.parent / "configs" / "smoke.toml"
+    assert call("bake", smoke, "--probes.file", tmp_path / "probes.json", "--out", tmp_path / "run") == 2
+    (line,) = capsys.readouterr().err.splitlines()  # no stage before it
+    assert line.startswith("ddprt: probes.file")
 
 
 @pytest.mark.parametrize("source", ["grid", "file"])

@@ -18,6 +18,7 @@ from ddprt.dataset import store
 from ddprt.dataset.denoise import find_denoiser
 from ddprt.dataset.indirect import IndirectBake
 from ddprt.dataset.manifest import Manifest, map_name
+from ddprt.dataset.probes import probe_layers
 from ddprt.dataset.sameness import baked_settings, counts, differences, pictures
 from ddprt.dataset.scratch import remove_left
 from ddprt.dataset.splits import Once, Splits, check_choice, choose_lightings, chosen, doubt, grouped
@@ -167,6 +168,7 @@ class _Bake:
         check_choice(self.config, self.first)
         if foggy(self.scene):
             self._judge_fog()
+        probe_layers(self.config, self.scene)  # a list of probes that cannot be read is told before the work, not after it
         with alone_in(self.folder):
             return self._alone(given, keep_alive)
 

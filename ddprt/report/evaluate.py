@@ -268,17 +268,18 @@ def spot_check(scene: Scene, data: Dataset, config: Config) -> dict[str, Any]:
 
     Returns:
       z-scores, the relative bias, and the values of both sides, (lightings, texels, 3); empty where it is switched off, with
-      None for what no value tells; empty too where light passes through bodies, which the reference integrator does not follow.
+      None for what no value tells; empty too where light passes through bodies or hair: the reference follows neither.
     """
     from ddprt.transport.effects import plan
     from ddprt.transport.embree import Tracer
+    from ddprt.transport.hairiness import hairy
     from ddprt.transport.openness import build_open_atlas
     from ddprt.transport.reference import Estimate, on_texels, trace_reference
     from ddprt.transport.translucency import filled
 
     test = data.split("test")[: config.report.spot_check_lightings]
     count = min(config.report.spot_check_texels, int(data.covered.sum()))
-    if count == 0 or any(filled(scene)):
+    if count == 0 or any(filled(scene)) or hairy(scene):
         return {}
     tracer = Tracer.of(scene, config.transport.threads)
     atlas, _ = build_open_atlas(tracer, scene, config.atlas.resolution, config.atlas.padding)

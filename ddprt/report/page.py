@@ -240,7 +240,8 @@ def _pictures(
     if scene is not None:
         atlas = data.description["atlas"]
         tracer = Tracer.of(scene, config.transport.threads)
-        uv = data.uv if data.imported else unwrap(scene, atlas["resolution"], atlas["padding"])[0]
+        laid = data.imported or scene.tubes is not None  # strands have texels along them, not charts
+        uv = data.uv if laid else unwrap(scene, atlas["resolution"], atlas["padding"])[0]
         assert uv is not None
         view = take_view(tracer, uv, data.covered, default_camera(scene))
         seen = shots(evaluation, data, main, model, scene, tracer, uv, config.report.views)

@@ -74,6 +74,8 @@ def _listed(path: str) -> Float64[np.ndarray, "places 3"]:
         position = np.array(listed, np.float64)
         if position.ndim != 2 or position.shape[1] != 3 or len(position) == 0:
             raise ValueError(f"got shape {position.shape}")
+        if odd := [entry for place in listed for entry in place if isinstance(entry, bool | str)]:
+            raise ValueError(f"got {odd[0]!r} for a number")
     except UserError:
         raise
     except OSError as error:

@@ -64,7 +64,7 @@ def trace_reference(
       seed: of the paths; equal seeds give equal bits whatever the number of threads.
       bounces: -1 follows every path to its end by roulette; otherwise at most this many.
     """
-    refuse_hairy(scene, "the reference", "use transport.trace_paths,")
+    refuse_hairy(scene, "the reference", "use transport.trace_paths")
     refuse_filled(scene, "unbiased paths")
     refuse_fog_beside(scene, any(glossy(scene)))
     lights = centred(tracer, lighting)
