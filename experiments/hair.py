@@ -33,7 +33,7 @@ from ddprt.transport.embree import Tracer
 from ddprt.transport.hair import Hair
 from ddprt.transport.openness import build_open_atlas
 from ddprt.transport.paths import trace_paths
-from ddprt.transport.shading import shade, shift
+from ddprt.transport.shading import lamps_of, shade
 
 RESOLUTION = {300: 96, 1000: 128, 10_000: 352, 140_000: 1216}
 BASES, SPACES = (4, 16, 64), ("linear", "gamma")
@@ -95,7 +95,7 @@ def seen(
     camera, hair = Camera((0.0, 0.12, 0.34), (0.0, -0.012, 0.0), 38.0, 1.0), Hair.of(tracer, scene)
     side = PIXELS * WITHIN
     indirect, direct = np.zeros((2, side * side, 3)), np.zeros((side * side, 3))
-    lamps = [[(light, shift(light)) for light in centred(tracer, lighting)]]
+    lamps = lamps_of(tracer, [lighting])
     rng, corners = seeds.stream(0, "camera"), atlas.uv * atlas.resolution
     for first in range(0, side * side, 1 << 16):
         pixel = np.arange(first, min(first + (1 << 16), side * side))

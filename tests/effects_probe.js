@@ -1,20 +1,4 @@
 // Runs in the page after the viewer: what it shows of own lamps and of held-out lightings.
-const asked = JSON.parse(document.getElementById("asked").textContent);
-const app = window.ddprt;
-const report = {};
-const pixels = () => {
-  const image = new Image();
-  const canvas = document.createElement("canvas");
-  return new Promise((done) => {
-    image.onload = () => {
-      [canvas.width, canvas.height] = [image.width, image.height];
-      canvas.getContext("2d").drawImage(image, 0, 0);
-      const { width, height, data } = canvas.getContext("2d").getImageData(0, 0, image.width, image.height);
-      done({ width, height, data: Array.from(data) });
-    };
-    image.src = app.view.screenshot();
-  });
-};
 const half = (x) => {
   const [sign, exponent, part] = [x & 0x8000 ? -1 : 1, (x >> 10) & 31, x & 1023];
   return sign * (exponent === 0 ? part * 2 ** -24 : (1 + part / 1024) * 2 ** (exponent - 15));

@@ -28,7 +28,7 @@ from ddprt.scene.material import Emission, Gloss, Material
 from ddprt.scene.mesh import Scene
 from ddprt.scene.shapes import faceted, hollow
 from ddprt.transport.configured import configured_scene
-from ddprt.transport.direct import Texels, centred
+from ddprt.transport.direct import Texels
 from ddprt.transport.effects import force, plan
 from ddprt.transport.embree import Tracer, lifted
 from ddprt.transport.fog import Air
@@ -40,7 +40,7 @@ from ddprt.transport.meetings import pdf_henyey, sample_henyey
 from ddprt.transport.openness import build_open_atlas
 from ddprt.transport.paths import trace_paths
 from ddprt.transport.reference import on_points, on_texels, trace_reference
-from ddprt.transport.shading import shade, shift
+from ddprt.transport.shading import lamps_of, shade
 from ddprt.transport.walk import albedo_of, walked
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
@@ -220,7 +220,7 @@ def test_light_that_scatters_once_is_that_of_quadrature(g: float) -> None:
     np.testing.assert_allclose(found.direct[0], 4 * np.exp(-0.5 / np.array(fog.mean_free_path)), rtol=1e-3)
 
     count, runs, rng = 1 << 12, np.zeros((8, 1, 1, 3)), np.random.default_rng(5)
-    lamps = [[(light, shift(light)) for light in centred(tracer, lamp)]]
+    lamps = lamps_of(tracer, [lamp])
     for sums in runs:
         place, facing = start(np.zeros(count, int), rng)
         ways = warp.to_world(warp.sample_cosine(rng.random((count, 2), np.float32)), warp.frame(facing))

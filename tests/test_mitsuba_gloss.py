@@ -13,11 +13,10 @@ from ddprt.lights import parse_lighting
 from ddprt.scene.library import build
 from ddprt.scene.material import Gloss, Material
 from ddprt.scene.mesh import Scene
-from ddprt.transport.direct import centred
 from ddprt.transport.effects import force
 from ddprt.transport.embree import Tracer, lifted
 from ddprt.transport.gloss import Surfaces
-from ddprt.transport.shading import shade, shift
+from ddprt.transport.shading import lamps_of, shade
 from ddprt.transport.walk import albedo_of, walked
 
 pytestmark = pytest.mark.slow
@@ -96,7 +95,7 @@ def sent_out(scene: Scene, triangle: np.ndarray, weights: np.ndarray, towards: n
     By whole paths: lightmaps, in which a layer of exitant light ends its rays, would add the blur of their texels.
     """
     tracer, lamp = Tracer.of(scene, 2), parse_lighting(LIGHT)
-    surfaces, lamps, found = Surfaces.of(tracer, scene), [[(light, shift(light)) for light in centred(tracer, lamp)]], []
+    surfaces, lamps, found = Surfaces.of(tracer, scene), lamps_of(tracer, [lamp]), []
     for point in range(len(triangle)):
         rng = seeds.stream(1, "mitsuba", point)
         face = np.full(SAMPLES, triangle[point], np.int32)

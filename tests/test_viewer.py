@@ -34,7 +34,7 @@ from ddprt.transport.embree import Tracer
 
 TYPES = {"f2": "<f2", "f4": "<f4", "f8": "<f8", "i4": "<i4", "u1": "u1"}
 
-PROBE = Path(__file__).parent / "viewer_probe.js"
+PROBE = "".join((Path(__file__).parent / name).read_text("utf-8") for name in ("page_probe.js", "viewer_probe.js"))
 
 
 @pytest.fixture(scope="module")
@@ -272,7 +272,7 @@ def asked(model: Model, data: Dataset, statue: Scene, tmp_path_factory: pytest.T
         "bad_links": BAD_LINKS,
         "drawn": {"lamps": LAMPS["all"]},
     }
-    found = browsed(page(pack(model, data)), question, PROBE.read_text("utf-8"), folder)
+    found = browsed(page(pack(model, data)), question, PROBE, folder)
     return Asked(models, np.array(values), measuring, rays, statue, found)
 
 

@@ -23,7 +23,7 @@ from ddprt.scene.library import build
 from ddprt.transport.embree import Tracer
 from ddprt.transport.measure import measure
 
-PROBE = Path(__file__).parent / "effects_probe.js"
+PROBE = "".join((Path(__file__).parent / name).read_text("utf-8") for name in ("page_probe.js", "effects_probe.js"))
 SMALL = {"atlas.resolution": "40", "points.count": "16", "points.supersample": "4", "transport.samples": "32"}
 SMALL |= {"transport.test_samples": "32", "transport.threads": "2"}
 AROUND = {"points.on": "hull", "lightings.distribution": "around"}
@@ -108,7 +108,7 @@ def shown(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     model = ddprt.fit(data, bases=5)
     packed = pack(model, data, stitch=False)
     question = {"lamps": lightings[11]}
-    return Shown(scene, model, packed, data, browsed(page(packed), question, PROBE.read_text("utf-8"), folder))
+    return Shown(scene, model, packed, data, browsed(page(packed), question, PROBE, folder))
 
 
 @pytest.mark.slow

@@ -1,19 +1,4 @@
 // Runs in the page after the viewer: does what a user does, and leaves what it found in the document.
-const asked = JSON.parse(document.getElementById("asked").textContent);
-const app = window.ddprt;
-const report = {};
-const pixels = () => {
-  const image = new Image();
-  const canvas = document.createElement("canvas");
-  return new Promise((done) => {
-    image.onload = () => {
-      [canvas.width, canvas.height] = [image.width, image.height];
-      canvas.getContext("2d").drawImage(image, 0, 0);
-      done(canvas.getContext("2d").getImageData(0, 0, image.width, image.height));
-    };
-    image.src = app.view.screenshot();
-  });
-};
 const different = (a, b) => a.data.reduce((sum, x, i) => sum + (x !== b.data[i]), 0);
 const key = (name) => window.dispatchEvent(Object.assign(new KeyboardEvent("keydown", { key: name, cancelable: true })));
 const composed = (frame, values, bases = 99) => {

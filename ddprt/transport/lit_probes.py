@@ -62,8 +62,7 @@ def choose_rays(
     fewer = np.ascontiguousarray(lit.irradiance[:, :, chosen])
     few = replace(lit, lamps=[lit.lamps[index] for index in chosen], irradiance=fewer)
 
-    def run(rays: int, turn: int) -> np.ndarray:
-        parts = gather(few, position[some], rays, seed=seed, stream=f"{stream} probe pilot {turn}")
-        return np.concatenate(list(parts), 1).astype(np.float64)
+    def gathered(rays: int, stream: str) -> Iterator[np.ndarray]:
+        return gather(few, position[some], rays, seed=seed, stream=stream)
 
-    return rays_for(run, target, halves)
+    return rays_for(gathered, target, halves, stream)

@@ -15,10 +15,9 @@ from ddprt import harmonics, seeds, warp
 from ddprt.axes import Float32, Float64
 from ddprt.lights import Lighting
 from ddprt.scene.mesh import Scene
-from ddprt.transport.direct import centred
 from ddprt.transport.embree import Tracer
 from ddprt.transport.probes import ORDER, pilots, rays_for
-from ddprt.transport.shading import Lamp, shade, shift
+from ddprt.transport.shading import Lamp, lamps_of, shade
 from ddprt.transport.walk import Air, Albedo, albedo_of, walked
 
 CALL = 1 << 12  # paths at a time: each keeps its light of all lightings
@@ -43,9 +42,8 @@ class Walks:
     @classmethod
     def of(cls, tracer: Tracer, scene: Scene, lightings: Sequence[Lighting], bounces: int) -> "Walks":
         """In a scene of diffuse surfaces; lightings in world space."""
-        lamps = [[(light, shift(light)) for light in centred(tracer, lighting)] for lighting in lightings]
         air = import_module("ddprt.transport.fog").Air(tracer.medium) if tracer.medium else None
-        return cls(tracer, albedo_of(scene), air, lamps, bounces)
+        return cls(tracer, albedo_of(scene), air, lamps_of(tracer, lightings), bounces)
 
 
 def gather(
@@ -96,8 +94,7 @@ def choose_rays(
     some, chosen = pilots(len(position), len(walks.lamps))
     few = replace(walks, lamps=[walks.lamps[index] for index in chosen])
 
-    def run(rays: int, turn: int) -> np.ndarray:
-        parts = gather(few, position[some], rays, seed=seed, stream=f"{stream} probe pilot {turn}")
-        return np.concatenate(list(parts), 1).astype(np.float64)
+    def gathered(rays: int, stream: str) -> Iterator[np.ndarray]:
+        return gather(few, position[some], rays, seed=seed, stream=stream)
 
-    return rays_for(run, target, halves)
+    return rays_for(gathered, target, halves, stream)

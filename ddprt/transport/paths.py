@@ -23,13 +23,12 @@ from ddprt.axes import Float32, Float64, Int
 from ddprt.lights import Lighting
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
-from ddprt.transport.direct import centred
 from ddprt.transport.embree import Tracer
 from ddprt.transport.fogginess import refuse_fog_beside
 from ddprt.transport.gather import Receivers
 from ddprt.transport.glossiness import glossy, glossy_surfaces
 from ddprt.transport.hairiness import strands_of
-from ddprt.transport.shading import shade, shift
+from ddprt.transport.shading import lamps_of, shade
 from ddprt.transport.translucency import refuse_filled
 from ddprt.transport.walk import Meetings, albedo_of, starts, walked
 
@@ -73,7 +72,7 @@ def trace_paths(
     Yields:
       The number of texels of each finished tile, in order, the skipped ones included.
     """
-    lamps = [[(light, shift(light)) for light in centred(tracer, lighting)] for lighting in lightings]
+    lamps = lamps_of(tracer, lightings)
     settings: dict[str, Any] = {"samples": samples, "seed": seed, "stream": stream, "bounces": bounces}
     chosen: dict[str, Any] = {"skip": skip, "texels": texels, "smooth": smooth}
     yield from follow(tracer, scene, atlas, partial(shade, tracer, lamps), out, **chosen, **settings)

@@ -159,11 +159,10 @@ def choose_rays(
     some, chosen = pilots(len(position), radiosity.shape[1] // 3)
     light, near = columns_of(radiosity, chosen), near.some(chosen) if near else None
 
-    def run(rays: int, turn: int) -> np.ndarray:
-        parts = gather(operator, light, position[some], rays, seed=seed, stream=f"{stream} probe pilot {turn}", near=near)
-        return np.concatenate(list(parts), 1).astype(np.float64)
+    def gathered(rays: int, stream: str) -> Iterator[np.ndarray]:
+        return gather(operator, light, position[some], rays, seed=seed, stream=stream, near=near)
 
-    return rays_for(run, target, halves)
+    return rays_for(gathered, target, halves, stream)
 
 
 def pilots(places: int, lightings: int) -> tuple[Int[np.ndarray, " places"], Int[np.ndarray, " lightings"]]:
@@ -176,14 +175,21 @@ def pilots(places: int, lightings: int) -> tuple[Int[np.ndarray, " places"], Int
 
 
 def rays_for(
-    run: Callable[[int, int], Float64[np.ndarray, "lightings some harmonics 3"]], target: float, halves: int
+    gathered: Callable[[int, str], Iterator[Float32[np.ndarray, "lightings some harmonics 3"]]],
+    target: float,
+    halves: int,
+    stream: str,
 ) -> tuple[int, float]:
     """Rays of each probe (of each half) that reach a noise, and the noise that they will leave.
 
     Args:
-      run: light of some probes by so many rays, for a turn that has random numbers of its own.
-      target, halves: see `choose_rays`.
+      gathered: light of some probes by so many rays, from a stream of random numbers.
+      target, halves, stream: see `choose_rays`.
     """
+
+    def run(rays: int, turn: int) -> Float64[np.ndarray, "lightings some harmonics 3"]:
+        return np.concatenate(list(gathered(rays, f"{stream} probe pilot {turn}")), 1).astype(np.float64)
+
     runs = {rays: (run(rays, 0), run(rays, 1)) for rays in (_FEW, _MANY)}
     mean = float(np.mean([part[:, :, 0].mean() for part in runs[_MANY]])) / _BAND
     if mean <= 0:

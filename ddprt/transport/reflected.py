@@ -16,11 +16,10 @@ from ddprt.compiled import compiled
 from ddprt.lights import Lighting
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import Scene
-from ddprt.transport.direct import centred
 from ddprt.transport.embree import Tracer
 from ddprt.transport.gather import BACK, Landing, landed_on
 from ddprt.transport.gloss import Surfaces
-from ddprt.transport.shading import Lamp, shade, shift
+from ddprt.transport.shading import Lamp, lamps_of, shade
 from ddprt.transport.walk import Albedo, albedo_of
 
 
@@ -78,7 +77,7 @@ class Lit:
         emitters: Any = None,
     ) -> "Lit":
         """A scene, lightings in world space, and the light that they, or emitters, bring to an atlas."""
-        lamps = [[(light, shift(light)) for light in centred(tracer, lighting)] for lighting in lightings]
+        lamps = lamps_of(tracer, lightings)
         landing = Landing.of(atlas, np.arange(atlas.count, dtype=np.int32))
         return cls(Surfaces.of(tracer, scene), albedo_of(scene), lamps, landing, irradiance, emitters)
 

@@ -8,8 +8,9 @@ import numpy as np
 
 from ddprt.axes import Float32, Float64
 from ddprt.compiled import compiled
-from ddprt.lights import Light
+from ddprt.lights import Light, Lighting
 from ddprt.lights.light import Illumination
+from ddprt.transport.direct import centred
 from ddprt.transport.embree import Tracer
 from ddprt.transport.walk import Meetings
 
@@ -57,6 +58,11 @@ def shade(
                     _collect(*arriving)
                 else:
                     import_module("ddprt.transport.tinted").into_receivers(sample.tint.T, *arriving)
+
+
+def lamps_of(tracer: Tracer, lightings: Sequence[Lighting]) -> list[list[Lamp]]:
+    """The lamps of each lighting (world space), as `shade` takes them."""
+    return [[(light, shift(light)) for light in centred(tracer, lighting)] for lighting in lightings]
 
 
 def shift(light: Light) -> Float32[np.ndarray, "3"]:
