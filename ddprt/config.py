@@ -1,12 +1,15 @@
 """Every setting of a run: one frozen model per section, in the order of the walk.
 
 TOML goes in, the resolved configuration comes out and is accepted as input again. `--section.key value` on the command
-line overrides the file. This module imports no room, so that `ddprt --help` stays instant.
+line overrides the file. Relative paths count from the folder of the file that they stand in, and on the command line from
+the working folder. This module imports no room, so that `ddprt --help` stays instant.
 """
 
 import hashlib
 import json
+import os
 import tomllib
+from collections.abc import Callable
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -34,6 +37,8 @@ from ddprt.sections import (
     TransportConfig,
     TuneConfig,
 )
+
+_PATHS = ("scene.name", "scene.poses", "lightings.file", "points.file", "probes.file")
 
 
 class Config(Section):
@@ -82,9 +87,11 @@ class Config(Section):
         """Whether keyframes are asked for."""
         return bool(self.animation.keys) or bool(self.scene.poses)
 
-    def to_toml(self) -> str:
-        """The resolved configuration as TOML, accepted as input again."""
+    def to_toml(self, folder: Path | None = None) -> str:
+        """The resolved configuration as TOML, accepted as input again; of a file that will lie in `folder`, if one is given."""
         document = self.model_dump(mode="json")
+        if folder:
+            _move(document, lambda path: path if os.path.isabs(path) else os.path.relpath(path, folder))
         lines = [f"seed = {document.pop('seed')}"]
         for section, values in document.items():
             lines += ["", f"[{section}]", *(f"{key} = {_toml(value)}" for key, value in values.items())]
@@ -103,7 +110,7 @@ def load_config(path: str | Path | None, overrides: dict[str, str] | None = None
       path: the file, or None for the defaults.
       overrides: dotted key to the text given on the command line, e.g. `{"fit.bases": "32"}`.
     Returns:
-      The validated configuration. Relative paths in it are taken from the working directory.
+      The validated configuration. Relative paths in it count from the working folder; those of the file have been moved.
     Raises:
       UserError: one line with file, key, got, expected and what to do for the first fault.
     """
@@ -117,6 +124,8 @@ def load_config(path: str | Path | None, overrides: dict[str, str] | None = None
             raise UserError(
                 f"{path}: got text that is not TOML ({error}), expected [section] and key = value; mend it"
             ) from None
+        folder = Path(path).parent
+        _move(document, lambda path: str(folder / path))
     overrides = {_as_written(dotted): text for dotted, text in (overrides or {}).items()}
     for dotted, text in overrides.items():
         check_key(dotted)
@@ -199,6 +208,20 @@ def check_key(dotted: str, verb: str = "run") -> None:
     known, free = keys(), ("scene.parameters.", "methods.settings.", "sweep.", "budget.scenario.")
     if _as_written(dotted) not in known and not dotted.startswith(free):
         raise UserError(f"--{dotted}: unknown key{nearest(dotted, known)}; `ddprt {verb} --help` lists all")
+
+
+def _move(document: dict[str, Any], move: Callable[[str], str]) -> None:
+    """Changes the paths of a document in place; what is of the wrong kind is refused later."""
+    for dotted in _PATHS:
+        section, leaf = dotted.split(".")
+        table = document.get(section)
+        if not isinstance(table, dict):
+            continue
+        value = table.get(leaf)
+        if isinstance(value, list):
+            table[leaf] = [move(path) if isinstance(path, str) else path for path in value]
+        elif isinstance(value, str) and (Path(value).suffix or os.path.basename(value) != value):  # else a scene in code
+            table[leaf] = move(value)
 
 
 def _flat(table: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:

@@ -58,7 +58,8 @@ def _expected(fault: Mapping[str, Any], example: Any) -> str:
     if kind == "missing" and isinstance(where, int):
         return f"at least {where + 1} entries"
     if kind == "tuple_type":
-        return f"a list such as {_as_json(example)}" if isinstance(example, list | tuple) and example else "a list"
+        example = example if isinstance(example, list | tuple) and example else [fault["input"]]
+        return f"a list such as {_as_json(example)}"
     text = fault["msg"].removeprefix("Input should be ").removeprefix("a valid ")
     return text.removeprefix("Input should have ").split(", unable")[0]
 

@@ -94,7 +94,7 @@ class Run:
             data = bake_to_target(scene, self.config, self.folder / "dataset", self.progress)
         else:
             data = bake(scene, config=self.config, out=self.folder / "dataset", progress=self.progress)
-        write_text(self.folder / "config.toml", self.config.to_toml())
+        write_text(self.folder / "config.toml", self.config.to_toml(self.folder))
         if not any(stage.get("rays") for stage in self.progress.stages):
             self._remember_bake()
         return data
@@ -182,7 +182,7 @@ class Run:
         for name in names:  # another fit is to take its own time
             for path in (self.folder / "training" / name).glob("*.safetensors"):
                 path.unlink()
-        write_text(self.folder / "config.toml", self.config.to_toml())
+        write_text(self.folder / "config.toml", self.config.to_toml(self.folder))
         return models, seconds
 
     def evaluate(self, data: Dataset, models: dict[str, Any], seconds: dict[str, float]) -> Any:

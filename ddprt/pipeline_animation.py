@@ -59,7 +59,7 @@ class AnimatedRun:
         self._check()
         make_folder(self.folder)
         data = bake_animation(self.animation, config=self.config, out=self.folder / "dataset", progress=self.progress)
-        write_text(self.folder / "config.toml", self.config.to_toml())
+        write_text(self.folder / "config.toml", self.config.to_toml(self.folder))
         return data
 
     def dataset(self, *, shines: bool = False) -> AnimatedData:
@@ -80,7 +80,7 @@ class AnimatedRun:
             seconds = time.perf_counter() - begun
             stage.facts["status"] = ", ".join(sorted({status for model in models.values() for status in model.statuses}))
         next(iter(models.values())).save(self.folder / "model.ddprt")
-        write_text(self.folder / "config.toml", self.config.to_toml())
+        write_text(self.folder / "config.toml", self.config.to_toml(self.folder))
         return models, dict.fromkeys(models, seconds)
 
     def evaluate(self, data: AnimatedData, models: Mapping[str, Any], seconds: Mapping[str, float]) -> dict[str, Any]:

@@ -81,6 +81,8 @@ class AnimationConfig(Section):
             raise ValueError(
                 f"got {wrong[0]:g}, expected shares above 0 and below 1; leave it out, keyframes are tested anyway"
             )
+        if len(set(shares)) < len(shares):
+            raise ValueError(f"got {list(shares)}, expected each share once; leave out what is there twice")
         return shares
 
     @field_validator("clip", mode="before")

@@ -127,7 +127,10 @@ def view(call: Call) -> None:
         raise UserError("--dataset: got one beside --time, expected none: a pose has other texels than its model; leave it out")
     model = _model_at(call, call.file("a model folder such as runs/cornell/model.ddprt"))
     data = open_dataset(call.options["dataset"]) if call.asks("dataset") else None
-    made = page(pack(model, data))
+    packed = pack(model, data)
+    if call.asks("time"):
+        packed["notes"].insert(0, f"Of what moves, the pose at {float(call.options['time']):g} s is shown.")
+    made = page(packed)
     if out is None:
         serve(made, int(port), browse=not call.asks("no-open"))
         return

@@ -447,6 +447,7 @@ def test_what_cannot_follow_a_pose_is_refused(arm: Animation, tmp_path: Path) ->
         ("[animation]\nkeys = []", r"animation.keys: got \[\], expected integer"),
         ("[animation]\nbetween = [1.0]", "animation.between"),
         ("[animation]\nbetween = [0, 1]", r"animation.between: got 0, expected shares above 0 and below 1; leave it out"),
+        ("[animation]\nbetween = [0.5, 0.5]", r"animation.between: got \[0.5, 0.5\], expected each share once"),
         ('[animation]\nmatrices = "some"', "animation.matrices"),
     ):
         (tmp_path / "bad.toml").write_text(text)
@@ -534,6 +535,8 @@ def test_from_configuration_to_export(tmp_path: Path, capsys: pytest.CaptureFixt
     light = '[{"type": "directional", "direction": [0, -1, 0.3], "irradiance": [1, 1, 1]}]'
     model = out / "model.ddprt"
     assert call("relight", model, "--lighting", light, "--time", "0.2", "--out", tmp_path / "relit.exr") == 0
+    assert call("view", model, "--time", "0.2", "--html", tmp_path / "arm.html") == 0
+    assert "the pose at 0.2 s is shown" in (tmp_path / "arm.html").read_text("utf-8")
     capsys.readouterr()
     for words, says in (
         (("relight", model, "--lighting", light), "no --time"),

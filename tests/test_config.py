@@ -42,6 +42,28 @@ def test_overrides_win_over_the_file() -> None:
     assert load_config(None, {"scene.parameters.albedo": "0.25"}).scene.parameters == {"albedo": 0.25}
 
 
+def test_paths_count_from_the_file_that_names_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    job, run = tmp_path / "jobs" / "room.toml", tmp_path / "runs" / "room"
+    run.mkdir(parents=True)
+    job.parent.mkdir()
+    job.write_text('scene = {name = "room.glb", poses = ["a.obj", "/b.obj"]}\nlightings.file = "../lamps.json"\n')
+    assert load_config(job).scene.name == str(job.with_name("room.glb"))
+    config = load_config("jobs/room.toml", {"points.file": "points.json"})
+    assert (config.scene.name, config.scene.poses) == ("jobs/room.glb", ("jobs/a.obj", "/b.obj"))
+    assert Path(config.lightings.file).resolve() == tmp_path / "lamps.json"
+    assert config.points.file == "points.json", "typed, and so from the working folder"
+    again = run / "config.toml"
+    again.write_text(config.to_toml(Path("runs/room")))
+    assert str(tmp_path) not in again.read_text()
+    monkeypatch.chdir("/")
+    moved = load_config(again)
+    assert Path(moved.scene.name).resolve() == job.with_name("room.glb")
+    assert [Path(pose).resolve() for pose in moved.scene.poses] == [job.with_name("a.obj"), Path("/b.obj")]
+    assert Path(moved.points.file).resolve() == tmp_path / "points.json"
+    assert (moved.probes.file, load_config(CONFIGS[0]).scene.name) == ("", "lion")
+
+
 FAULTS = {
     "unknown section": ("[fitt]\nbases = 3\n", {}, ["fitt", "unknown key", 'did you mean "fit"?']),
     "unknown key": ("[fit]\nbase = 3\n", {}, ["fit.base", "unknown key", 'did you mean "bases"?']),
@@ -87,7 +109,11 @@ FAULTS = {
     ),
     "a list that lacks all": ("[probes]\ngrid = []\n", {}, ["probes.grid: got [], expected at least 3 entries; mend it"]),
     "a list that lacks two": ("[probes]\ngrid = [2]\n", {}, ["probes.grid: got [2], expected at least 3 entries; mend it"]),
-    "a word for a list of any length": ("", {"effects.on": "fog"}, ["--effects.on: got 'fog', expected a list; mend it"]),
+    "a word for a list of any length": (
+        "",
+        {"effects.on": "fog"},
+        ["--effects.on: got 'fog', expected a list such as [\"fog\"]; mend it"],
+    ),
     "a word for a number or three": (
         '[scene.fog]\nmean_free_path = "thick"\n',
         {},

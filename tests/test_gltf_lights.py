@@ -50,7 +50,7 @@ def test_every_kind_where_its_node_is(tmp_path: Path) -> None:
     assert ddprt.scene_lights(str(path)) == (point, spot, sun)
     assert load_scene(path).notes == (
         "no material on some triangles: albedo 0.8 assumed",
-        "3 lights in the file: they shine where lightings.file names it",
+        "3 lights in the file, to shine where lightings.file names it",
     )
 
 

@@ -555,6 +555,7 @@ def test_glb_header_is_held_against_the_length(tmp_path: Path) -> None:
         ("nowhere/room.glb", {}, rf"no such file.*, which counts from {re.escape(str(Path.cwd()))}$"),
         ("/nowhere/room.obj", {}, "no such file, expected a mesh; check the path$"),
         (Path("cornell"), {}, 'suffix ""'),
+        (str(Path(__file__).parent), {}, "got a folder, expected a file that ends in .glb"),
         ("furnace", {"albdeo": 1.0}, 'did you mean "albedo"'),
     ],
 )

@@ -23,12 +23,14 @@ _SAID = {"placing": "points", "counts": "lightings"}  # what dataset.json calls 
 def baked_settings(config: Config, scene: Scene) -> dict[str, Any]:
     """What a dataset depends on besides its lightings and points."""
     transport = config.transport.model_dump(exclude={"threads"})
+    placing, file = config.points.model_dump(exclude={"quantity"}), Path(config.points.file)
+    placing |= {"file": sha256(file)[:16]} if file.is_file() else {}  # its content counts, wherever it lies
     return {
         "scene": {"name": scene.name, "digest": scene.digest, "notes": list(scene.notes)},
         "atlas": config.atlas.model_dump(exclude={"use"}),  # the scene's digest says which charts are used
         "seed": config.seed,
         "transport": transport | {"integrator": valid_integrator(transport["integrator"], scene)},
-        "placing": config.points.model_dump(exclude={"quantity"}),
+        "placing": placing,
         "layers": probe_layers(config, scene) + gloss_layers(config, scene),
     }
 

@@ -91,7 +91,9 @@ def export_textures(
     folder = Path(folder)
     mono, has_mean = model.encoding.channels == "mono", len(maps.values) > maps.bases
     if tuple(formats) != ("exr",) and not len(maps.values):
-        raise UserError('export.formats: got a model without any light, which has no textures; keep formats = ["exr"]')
+        raise UserError(
+            "export.formats: got a model without any light, expected some to scale by; leave formats and engines out"
+        )
     sizes = np.abs(maps.values[: maps.bases]).max((1, 2, 3), initial=0)
     scale = np.where(sizes > 0, sizes, 1).astype(np.float32)
     written: list[Path] = []

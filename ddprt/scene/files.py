@@ -64,6 +64,8 @@ def _clear(source: str | Path, parameters: dict[str, float | int], *, lightmap: 
             f'no scene "{name}"{nearest(name, SCENES)}; known: {known}, or a path that ends in {", ".join(SUFFIXES)}'
         )
     if suffix not in SUFFIXES:
+        if path.is_dir():
+            raise UserError(f"{path}: got a folder, expected a file that ends in {', '.join(SUFFIXES)}; name one in it")
         raise UserError(f'{path}: got suffix "{path.suffix}", expected {", ".join(SUFFIXES)}; export to glTF')
     try:
         there = path.is_file()

@@ -234,7 +234,7 @@ class Reader:
         lamps = (self.file.json.extensions or {}).get(LIGHTS, {}).get("lights", [])
         if lamps:
             self.ignored.discard(LIGHTS)
-            self.notes.append(f"{len(lamps)} lights in the file: they shine where lightings.file names it")
+            self.notes.append(f"{len(lamps)} light{'s' * (len(lamps) > 1)} in the file, to shine where lightings.file names it")
 
     def _lightmap(self, parts: list[_Part]) -> Float64[np.ndarray, "vertices 2"] | None:
         """Second texture coordinates of all vertices; None where no primitive has any, NaN where some have none."""

@@ -345,7 +345,7 @@ def tune(config: Config, folder: Path, progress: Any) -> Outcome:
         outcome = Search(config, workshop).run()
         for name in ("tuned.toml", "nearest.toml"):
             (folder / name).unlink(missing_ok=True)
-        write_text(folder / ("tuned.toml" if outcome.met else "nearest.toml"), outcome.setting.config.to_toml())
+        write_text(folder / ("tuned.toml" if outcome.met else "nearest.toml"), outcome.setting.config.to_toml(folder))
         if not config.bench.keep:
             workshop.forget_all()
     return outcome
