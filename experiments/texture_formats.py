@@ -2,16 +2,17 @@
 
 Question: what do 8 bits a channel or BC6H cost beside half and float, what does fitting the transfer to rounded textures gain,
           and which range should maps be moved to before BC6H?
-Command:  python experiments/texture_formats.py            configs/cornell.toml, minutes
-          python experiments/texture_formats.py --quick    at 128², 64 lightings to learn from
+Command:  python experiments/texture_formats.py                      configs/cornell.toml, minutes
+          python experiments/texture_formats.py --resolution 1024    the same with more texels
+          python experiments/texture_formats.py --quick              at 128², 64 lightings to learn from
 Answer:   docs/export.md, "Formats"
 
 BC6H needs `pip install "ddprt[textures]"`. The bake lies in runs/formats-SIDE. The last line is JSON: bytes and held-out
 relative RMSE of each format, and whether BC6H keeps within 10 % of the error of floats.
 """
 
+import argparse
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -38,8 +39,14 @@ QUICK |= {"transport.target_noise": "0.02"}
 RANGES = ((0.0, 1.0), (0.25, 1.25), (0.5, 1.0), (1.0, 2.0), (2.0, 4.0), (0.0, 60000.0))
 
 
-def main(quick: bool) -> None:
-    config = load_config("configs/cornell.toml", QUICK if quick else {})
+def main() -> None:
+    """Bakes, fits and tells the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--resolution", type=int)
+    asked = parser.parse_args()
+    changes = (QUICK if asked.quick else {}) | ({"atlas.resolution": str(asked.resolution)} if asked.resolution else {})
+    config = load_config("configs/cornell.toml", changes)
     folder = Path("runs") / f"formats-{config.atlas.resolution}"
     data = ddprt.bake(ddprt.load_scene("cornell"), config=config, out=folder / "data")
     test = data.split("test")
@@ -86,4 +93,4 @@ def ranges(model: Model, held_out: HeldOut) -> None:
 
 
 if __name__ == "__main__":
-    main("--quick" in sys.argv[1:])
+    main()
