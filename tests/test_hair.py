@@ -17,9 +17,11 @@ from ddprt.scene.exr import write_exr
 from ddprt.scene.library import build
 from ddprt.scene.material import Emission, Gloss, Material
 from ddprt.scene.mesh import Scene
+from ddprt.scene.strand_texels import along_curve
 from ddprt.scene.tubes import TEXELS, bald, with_strands
 from ddprt.transport import fibre
 from ddprt.transport.along_strands import borrowing
+from ddprt.transport.direct import Texels
 from ddprt.transport.effects import force, plan
 from ddprt.transport.embree import Tracer
 from ddprt.transport.gather import Receivers
@@ -290,3 +292,40 @@ def test_a_scene_without_strands_loads_nothing_of_hair(fur: Scene) -> None:
     assert alone.tubes is None
     assert len(alone.triangles) + fur.tubes.triangles == len(fur.triangles)  # type: ignore[union-attr]
     assert bald(alone) is alone
+
+
+def test_neighbours_follow_each_other_along_the_curve() -> None:
+    points = np.random.default_rng(0).random((4096, 3)) * [1, 2, 0.5]
+    strides = [np.linalg.norm(np.diff(one, axis=0), axis=1).mean() for one in (points[along_curve(points)], points)]
+    assert strides[0] < 0.15 * strides[1]
+    assert along_curve(points[:1]).tolist() == [0]
+    np.testing.assert_array_equal(along_curve(np.zeros((3, 3))), np.arange(3))
+
+
+def test_strands_are_traced_by_place_and_stored_by_number(fur: Scene) -> None:
+    tracer = Tracer.of(fur, 1)
+    atlas, _ = build_open_atlas(tracer, fur, 96)
+    strands, order = len(fur.tubes.axis), atlas.order
+    skin = atlas.count - strands * TEXELS
+    np.testing.assert_array_equal(order[:skin], np.arange(skin))
+    np.testing.assert_array_equal(np.sort(order), np.arange(atlas.count))
+    rows = (order[skin:] - skin).reshape(strands, TEXELS)
+    np.testing.assert_array_equal(rows % TEXELS, np.tile(np.arange(TEXELS), (strands, 1)))
+    np.testing.assert_array_equal(rows[:, 0] // TEXELS, along_curve(fur.tubes.axis.mean(1)))
+    lamps = parse_lighting({"type": "point", "position": [0.1, 0.15, 0.05], "intensity": [1.0, 2.0, 3.0]})
+    sun = parse_lighting({"type": "directional", "direction": [0.3, -1.0, 0.2], "irradiance": [1.0, 1.0, 1.0]})
+    for lighting in (lamps, sun):
+        found = [
+            Texels.of(tracer, one, 4, np.random.default_rng(0)).irradiance(lighting, np.random.default_rng(1))
+            for one in (atlas, replace(atlas, order=None))
+        ]
+        assert found[0].any()
+        np.testing.assert_allclose(found[0], found[1], rtol=1e-6)
+    light = [np.zeros((1, atlas.count, 3), np.float32) for _ in range(2)]
+    settings = {"samples": 8, "seed": 2, "stream": "order"}
+    done = sum(trace_paths(tracer, fur, atlas, [sun], light[0], **settings))
+    for _ in trace_paths(tracer, fur, replace(atlas, order=None), [sun], light[1], **settings):
+        pass
+    assert done == atlas.count
+    ours, plain = (one.sum((0, 2))[skin:].reshape(strands, TEXELS).mean(1) for one in light)
+    assert np.corrcoef(ours, plain)[0, 1] > 0.5, "each strand has its own light, whatever the order"

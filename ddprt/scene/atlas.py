@@ -189,6 +189,7 @@ class Atlas:
       centre: of the scene; `sampler` works relative to it, so that float32 suffices.
       parted: texels that lie on both sides of a wall, and belong to one of them.
       part: which texel's light lies on each small square of those; -1 for none, where a square touches the wall itself.
+      order: to trace texels in, so that rays near each other follow each other; None where rows and columns do that.
     """
 
     resolution: int
@@ -209,6 +210,7 @@ class Atlas:
     piece_triangle: Int32[np.ndarray, " pieces"] = field(repr=False)
     parted: Int[np.ndarray, " parted"] = field(default_factory=lambda: np.zeros(0, np.int64), repr=False)
     part: Int32[np.ndarray, "parted down across"] = field(default_factory=lambda: np.zeros((0, 1, 1), np.int32), repr=False)
+    order: Int[np.ndarray, " texels"] | None = field(default=None, repr=False)
 
     @property
     def count(self) -> int:

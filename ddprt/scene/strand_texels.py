@@ -2,13 +2,16 @@
 
 Nothing is unwrapped. Rows of strands follow below the square that the rest of the scene is unwrapped into; the strip to the
 right of that square stays empty. A texel is a tenth of its strand, all about it: its area is the fibre's side area.
+
+Strands lie on the lightmap as they are numbered, which says little about where they stand. So they are traced in another order,
+along a Z-curve through their middles: shadow rays then find what they meet in the cache (docs/effects.md, Hair).
 """
 
 from dataclasses import replace
 
 import numpy as np
 
-from ddprt.axes import Float64
+from ddprt.axes import Float64, Int
 from ddprt.errors import UserError
 from ddprt.scene.atlas import Atlas
 from ddprt.scene.mesh import SIDES, Scene, Tubes
@@ -56,6 +59,7 @@ def with_strand_texels(atlas: Atlas | None, scene: Scene, resolution: int, *, si
     own = _own(scene, tubes, texel, column[::TEXELS], row[::TEXELS], resolution)
     own["albedo"] = np.tile(np.ones(3) if simulated else np.array(scene.materials[scene.material[-1]].albedo), (len(number), 1))
     own["chart"] = strand.astype(np.int32)
+    own["order"] = number.reshape(strands, TEXELS)[along_curve(tubes.axis.mean(1))].ravel()
     slot = np.full((resolution, resolution), -1, np.int32)
     if atlas is None:
         slot.ravel()[texel] = number
@@ -66,15 +70,24 @@ def with_strand_texels(atlas: Atlas | None, scene: Scene, resolution: int, *, si
     there = np.divmod(atlas.texel, side)
     own["chart"] += int(atlas.chart.max()) + 1
     own["piece_texel"] = own["piece_texel"] + count
+    own["order"] = own["order"] + count
     moved = (atlas.piece_corners + (atlas.centre - scene.centre)).astype(np.float32)
     before = {
         **{name: getattr(atlas, name) for name in own},
         "uv": atlas.uv * (side / resolution),
         "texel": there[0] * resolution + there[1],
         "piece_corners": moved,
+        "order": np.arange(count),
     }
     joined = {name: np.concatenate([before[name], own[name]]).astype(before[name].dtype) for name in own}
     return replace(atlas, resolution=resolution, centre=scene.centre, slot=slot, **joined)
+
+
+def along_curve(points: Float64[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+    """Order of points along a Z-curve through 1024 cells a side (Morton 1966)."""
+    cell = ((points - points.min(0)) * (1023 / max(float(np.ptp(points, axis=0).max()), 1e-300))).astype(np.int64)
+    bits = (((cell[:, axis] >> bit) & 1) << (3 * bit + axis) for bit in range(10) for axis in range(3))
+    return np.argsort(sum(bits, np.zeros(len(points), np.int64)), kind="stable")
 
 
 def _own(

@@ -64,7 +64,7 @@ class Texels:
       tracer: the occluders.
       atlas: the texels.
       shift: start of each texel's sequence of places.
-      places: `samples` of each texel.
+      places: `samples` of each texel, in the atlas's order.
     """
 
     tracer: Tracer
@@ -76,7 +76,8 @@ class Texels:
     def of(cls, tracer: Tracer, atlas: Atlas, samples: int, rng: np.random.Generator) -> "Texels":
         """So many places per texel."""
         shift = rng.random((atlas.count, 2), np.float32)
-        return cls(tracer, atlas, shift, _spread(tracer, atlas, samples, shift, np.arange(atlas.count)))
+        texels = np.arange(atlas.count) if atlas.order is None else atlas.order
+        return cls(tracer, atlas, shift, _spread(tracer, atlas, samples, shift[texels], texels))
 
     def irradiance(self, lighting: Lighting, rng: np.random.Generator) -> Float32[np.ndarray, "texels 3"]:
         """Mean E of each texel, shadows included.
@@ -93,6 +94,8 @@ class Texels:
         total = np.zeros((self.atlas.count, 3), np.float32)
         for light, there in zip(lighting, centred(self.tracer, lighting), strict=True):
             own = mean_irradiance(self.tracer, (there,), self.places, rng)
+            if self.atlas.order is not None:
+                own[self.atlas.order] = own.copy()
             for texels, samples in self._closer(light):
                 closer = _spread(self.tracer, self.atlas, samples, self.shift[texels], texels)
                 own[texels] = mean_irradiance(self.tracer, (there,), closer, rng)

@@ -97,7 +97,7 @@ def follow(
     refuse_filled(scene, "unbiased paths")
     refuse_fog_beside(scene, any(glossy(scene)))
     air = import_module("ddprt.transport.fog").Air(tracer.medium) if tracer.medium else None
-    receivers = Receivers.texels(atlas, samples, seed, f"{stream} paths", texels)
+    receivers = Receivers.texels(atlas, samples, seed, f"{stream} paths", atlas.order if texels is None else texels)
     albedo, hair = albedo_of(scene), strands_of(tracer, scene, smooth)
     gloss = hair or glossy_surfaces(tracer, scene)
 
