@@ -88,13 +88,13 @@ def bench(call: Call) -> None:
         return None
     if call.asks("peers"):
         return peers(call)
-    if call.asks("leagues") or call.asks("splits"):
-        return leagues(call)
     if call.asks("quick"):
         raise UserError("--quick: got no --peers, which it belongs to; a sweep is shortened by --sweep.SECTION.KEY")
+    if asked and (swept := [key for key in call.overrides if key.partition(".")[0] == "sweep"]):
+        raise UserError(f"--{swept[0]}: got {asked[0]}, which sweeps nothing, expected one of them; run it once for each")
+    if call.asks("leagues") or call.asks("splits"):
+        return leagues(call)
     if call.asks("effects"):
-        if swept := [key for key in call.overrides if key.partition(".")[0] == "sweep"]:
-            raise UserError(f"--{swept[0]}: got --effects, which sweeps nothing, expected one of them; run it once for each")
         job = call.run()
         print(f"{job.ablate()}\nresults:  {job.folder / 'bench' / 'effects.jsonl'}")
         return None

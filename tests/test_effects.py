@@ -562,6 +562,15 @@ def test_effects_sweep_nothing(flag: list[str], capsys: pytest.CaptureFixture) -
     assert len(told.splitlines()) == 1
 
 
+@pytest.mark.parametrize("flag", [["--sweep.fit.bases", "[2, 4]"], ["--quick"]])
+@pytest.mark.parametrize("asked", [["--leagues"], ["--splits", "noise"]])
+def test_leagues_neither_sweep_nor_are_shortened(asked: list[str], flag: list[str], capsys: pytest.CaptureFixture) -> None:
+    assert call("bench", HERE.parent / "configs" / "smoke.toml", *asked, *flag) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"ddprt: {flag[0]}: got ")
+    assert len(told.splitlines()) == 1
+
+
 def test_stages_belong_to_the_effect_that_they_are_named_after(tmp_path: Path) -> None:
     """Those of direct light count for every kind of light; what has no stage of its own cannot be told apart."""
     config = in_a_furnace()
