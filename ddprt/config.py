@@ -38,7 +38,16 @@ from ddprt.sections import (
     TuneConfig,
 )
 
-_PATHS = ("scene.name", "scene.poses", "lightings.file", "points.file", "probes.file")
+_PATHS = (
+    "scene.name",
+    "scene.poses",
+    "lightings.file",
+    "lightings.environment",
+    "points.file",
+    "probes.file",
+    "export.gltf_preview",
+)
+_NAMED = ("scene.name", "lightings.environment")  # a path, or the name of one in code
 
 
 class Config(Section):
@@ -91,7 +100,7 @@ class Config(Section):
         """The resolved configuration as TOML, accepted as input again; of a file that will lie in `folder`, if one is given."""
         document = self.model_dump(mode="json")
         if folder:
-            _move(document, lambda path: path if os.path.isabs(path) else os.path.relpath(path, folder))
+            _move(document, lambda path: _seen_from(path, folder))
         lines = [f"seed = {document.pop('seed')}"]
         for section, values in document.items():
             lines += ["", f"[{section}]", *(f"{key} = {_toml(value)}" for key, value in values.items())]
@@ -125,7 +134,7 @@ def load_config(path: str | Path | None, overrides: dict[str, str] | None = None
                 f"{path}: got text that is not TOML ({error}), expected [section] and key = value; mend it"
             ) from None
         folder = Path(path).parent
-        _move(document, lambda path: str(folder / path))
+        _move(document, lambda path: _seen_from(str(folder / path), Path()))
     overrides = {_as_written(dotted): text for dotted, text in (overrides or {}).items()}
     for dotted, text in overrides.items():
         check_key(dotted)
@@ -212,16 +221,31 @@ def check_key(dotted: str, verb: str = "run") -> None:
 
 def _move(document: dict[str, Any], move: Callable[[str], str]) -> None:
     """Changes the paths of a document in place; what is of the wrong kind is refused later."""
+
+    def moved(dotted: str, value: Any) -> Any:
+        if isinstance(value, list):
+            return [moved(dotted, one) for one in value]
+        named = dotted in _NAMED and isinstance(value, str) and not Path(value).suffix and os.path.basename(value) == value
+        return move(value) if isinstance(value, str) and value and not named else value
+
+    if isinstance(document.get("sweep"), dict):
+        document["sweep"] = dict(_flat(document["sweep"]))
+    budget = document.get("budget")
+    scenario = budget.get("scenario") if isinstance(budget, dict) else None
     for dotted in _PATHS:
         section, leaf = dotted.split(".")
-        table = document.get(section)
-        if not isinstance(table, dict):
-            continue
-        value = table.get(leaf)
-        if isinstance(value, list):
-            table[leaf] = [move(path) if isinstance(path, str) else path for path in value]
-        elif isinstance(value, str) and (Path(value).suffix or os.path.basename(value) != value):  # else a scene in code
-            table[leaf] = move(value)
+        tables = (document.get(section), leaf), (document.get("sweep"), dotted)
+        for table, key in (*tables, *([(scenario, leaf)] if section == "lightings" else [])):
+            if isinstance(table, dict) and key in table:
+                table[key] = moved(dotted, table[key])
+
+
+def _seen_from(path: str, folder: Path) -> str:
+    """A path as it counts from a folder, through whatever links lead to either; absolute ones stay."""
+    if os.path.isabs(path):
+        return path
+    parent, name = os.path.split(path)
+    return os.path.relpath(os.path.join(os.path.realpath(parent), name), os.path.realpath(folder))
 
 
 def _flat(table: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:

@@ -64,6 +64,38 @@ def test_paths_count_from_the_file_that_names_them(tmp_path: Path, monkeypatch: 
     assert (moved.probes.file, load_config(CONFIGS[0]).scene.name) == ("", "lion")
 
 
+def test_every_path_counts_from_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Skies, previews, files without an ending, sweeps and scenarios; words for what stands in code stay words."""
+    monkeypatch.chdir(tmp_path)
+    Path("jobs").mkdir()
+    lines = ["lightings = {environment = 'sky.exr', file = 'lamps'}", "export = {gltf = true, gltf_preview = 'lamp.json'}"]
+    lines += ["budget.scenario = {environment = 'dusk.hdr', lights = [1, 2]}", "[sweep]", "scene.name = ['a.glb', 'cornell']"]
+    Path("jobs/room.toml").write_text("\n".join([*lines, "'lightings.environment' = ['sky.hdr', 'sun-sky']"]))
+    config = load_config("jobs/room.toml")
+    assert (config.lightings.environment, config.lightings.file) == ("jobs/sky.exr", "jobs/lamps")
+    assert config.export.gltf_preview == "jobs/lamp.json"
+    assert config.budget.scenario == {"environment": "jobs/dusk.hdr", "lights": [1, 2]}
+    assert dict(config.sweep) == {
+        "scene.name": ("jobs/a.glb", "cornell"),
+        "lightings.environment": ("jobs/sky.hdr", "sun-sky"),
+    }
+    Path("jobs/again.toml").write_text(config.to_toml(Path("jobs")))
+    assert load_config("jobs/again.toml") == config
+    Path("jobs/word.toml").write_text("lightings.environment = 'gradient'")
+    assert load_config("jobs/word.toml").lightings.environment == "gradient"
+
+
+def test_paths_count_through_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder of runs that is a link to another disk; a mesh that is one keeps its name."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "disk" / "deep" / "room").mkdir(parents=True)
+    Path("runs").symlink_to(tmp_path / "disk" / "deep")
+    Path("stored").touch()
+    Path("room.glb").symlink_to("stored")
+    Path("runs/room/config.toml").write_text(load_config(None, {"scene.name": "room.glb"}).to_toml(Path("runs/room")))
+    assert load_config("runs/room/config.toml").scene.name == "room.glb"
+
+
 FAULTS = {
     "unknown section": ("[fitt]\nbases = 3\n", {}, ["fitt", "unknown key", 'did you mean "fit"?']),
     "unknown key": ("[fit]\nbase = 3\n", {}, ["fit.base", "unknown key", 'did you mean "bases"?']),

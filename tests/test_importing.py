@@ -332,6 +332,23 @@ def test_maps_that_are_black_where_they_count_are_refused(tmp_path: Path, lit: s
     assert ("they look upside down" in str(caught.value)) == upside
 
 
+def test_files_that_could_all_be_meant_are_refused(tmp_path: Path) -> None:
+    """Pictures of two endings, or two lists of lights, used to be left aside without a word; and .PNG was not found."""
+    (tmp_path / "direct").mkdir()
+    (tmp_path / "direct" / "a.PNG").touch()
+    assert load_recipe(tmp_path, {})[0].direct == "direct/*.PNG"
+    (tmp_path / "direct" / "b.exr").touch()
+    with pytest.raises(UserError, match=r"direct: got pictures that end in \.PNG and \.exr, expected one kind; .* --direct"):
+        load_recipe(tmp_path, {})
+    options = {"direct": "direct/*.exr"}
+    assert load_recipe(tmp_path, options)[0].direct == "direct/*.exr"
+    for name in ("lights.csv", "lights.json"):
+        (tmp_path / name).touch()
+    with pytest.raises(UserError, match=r"got lights\.csv and lights\.json, expected one list of lights; name it"):
+        load_recipe(tmp_path, options)
+    assert load_recipe(tmp_path, options | {"lights": "lights.csv"})[0].lights == "lights.csv"
+
+
 def test_an_import_says_what_it_leaves_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     board(tmp_path, slice(0, 4))
     for name in ("position", "normal"):

@@ -99,6 +99,9 @@ def test_a_dataset_keeps_the_viewpoint(cornell: Scene, tmp_path: Path) -> None:
     small = base(atlas__resolution=24, lightings__train=2, lightings__validation=1, lightings__test=1, transport__samples=1)
     bake(replace(cornell, viewpoint=EYE), config=small, out=tmp_path)
     assert ddprt.open_dataset(tmp_path).viewpoint == EYE
+    for eye in (EYE, replace(EYE, fov_deg=50.0)):  # the same light: nothing is baked again, and the first view stays
+        bake(replace(cornell, viewpoint=eye), config=small, out=tmp_path)
+    assert ddprt.open_dataset(tmp_path).viewpoint == EYE
 
 
 @pytest.mark.parametrize(

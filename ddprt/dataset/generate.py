@@ -222,7 +222,8 @@ class _Bake:
             (self.folder / "manifest.jsonl").unlink(missing_ok=True)  # it tells of a dataset that nobody knows any more
             store.write_description(self.folder, description)
         else:
-            self._refuse_other(there, {key: value for key, value in description.items() if key != "ddprt"})
+            told = {key: value for key, value in description.items() if key not in ("ddprt", "viewpoint")}
+            self._refuse_other(there, told)
         manifest = Manifest(self.folder)
         self._write_places(manifest, atlas, samples)
         dataset = Dataset(self.folder, description, keep_alive)

@@ -98,18 +98,29 @@ def _value(text: Any) -> Any:
 
 
 def _lying(folder: Path, given: Mapping[str, Any]) -> dict[str, str]:
-    """Files of the usual names in a folder."""
+    """Files of the usual names in a folder.
+
+    Raises:
+      UserError: several that could be meant, and no option says which.
+    """
     names = {path.name for path in folder.iterdir()}
     found = {}
     lights = [name for name in sorted(names) if name in ("lights.csv", "lights.json") or name.endswith(".lp")]
+    if len(lights) > 1 and "lights" not in given:
+        raise UserError(f"{folder}: got {' and '.join(lights)}, expected one list of lights; name it with --lights")
     if len(lights) == 1:
         found["lights"] = lights[0]
     photographs = str(given.get("lights", found.get("lights", ""))).endswith(".lp")
     for kind in () if photographs else ("direct", "indirect"):
         inside = sorted((folder / kind).iterdir()) if (folder / kind).is_dir() else []
-        suffixes = {path.suffix.lower() for path in inside} & set(_PICTURES)
+        suffixes = sorted({path.suffix for path in inside if path.suffix.lower() in _PICTURES})
+        if len(suffixes) > 1 and kind not in given:
+            raise UserError(
+                f"{folder / kind}: got pictures that end in {' and '.join(suffixes)}, expected one kind; take the others away, "
+                f"or name them with --{kind} '{kind}/*{suffixes[0]}'"
+            )
         if len(suffixes) == 1:
-            found[kind] = f"{kind}/*{suffixes.pop()}"
+            found[kind] = f"{kind}/*{suffixes[0]}"
     for key in _MAPS:
         there = [f"{key}{suffix}" for suffix in _PICTURES if f"{key}{suffix}" in names]
         if there:
