@@ -231,8 +231,10 @@ def test_a_contest_chooses_before_it_looks_and_goes_on(data: Dataset, tmp_path: 
             assert all(own[league] <= getattr(budgets, league) for own in place.trials)
     before, lines = (tmp_path / RESULTS).read_text(), len((tmp_path / RESULTS).read_text().splitlines())
     looked.clear()
+    (tmp_path / ".fit-killed" / "x").mkdir(parents=True)
     again = Contest(config, data, scene, tmp_path, QUIET).run()
     assert not looked
+    assert not list(tmp_path.glob(".fit-*"))
     assert [one.get("digest") for one in again] == [one.get("digest") for one in records]
     assert (tmp_path / RESULTS).read_text() == before
     cut = before.splitlines()

@@ -96,13 +96,13 @@ def test_hair_files_are_read(tmp_path: Path) -> None:
         ("a.strands", "strand\n0 0 0\n", "got 1 strands without length, the first of index 0"),
         ("a.strands", "strand\n1 2 3\n1 2 3\n", "got 1 strands without length"),
         ("a.strands", "", "got no strands"),
-        ("a.strands", "0 0 0\n", "a.strands, line 1: expected radius"),
+        ("a.strands", "0 0 0\n", 'a.strands, line 1: got "0 0 0", expected radius'),
         ("a.strands", "strand\n0 0\n", "line 2"),
         ("a.strands", "strand\n0 0 0\n\n0 0 0 1 1\n", "line 4"),
         ("a.strands", "colour 1 2\n", "line 1"),
         ("a.strands", "strand\n0 0 nan\n0 0 1\n", "got a point of .0.0, 0.0, nan. m in strand 0"),
         ("a.strands", "colour 2 0 0\nstrand\n0 0 0\n0 0 1\n", "got a colour that is not three numbers 0 to 1"),
-        ("a.strands", b"\xff\xfe", "line 0"),
+        ("a.strands", b"\xff\xfe", "a.strands: got bytes that are no text"),
     ],
 )
 def test_bad_files_are_refused_in_one_line(tmp_path: Path, name: str, data: bytes | str, message: str) -> None:

@@ -67,6 +67,18 @@ def test_a_leaking_body_is_refused_and_its_edges_are_counted() -> None:
     checked("whole", points, triangles, materials=milk)
 
 
+@pytest.mark.parametrize(
+    ("medium", "says"),
+    [(MILK, "got 3 open edges"), (replace(MILK, albedo=(2.0,) * 3), "three albedos from 0 to 1")],
+)
+def test_materials_changed_since_a_scene_was_read_are_looked_at_again(medium: Subsurface, says: str, tmp_path: Any) -> None:
+    points, triangles = icosphere(1)
+    scene = checked("ball", points, triangles[1:])
+    with pytest.raises(UserError, match=says):
+        ddprt.bake(scene.made_of(lambda material: replace(material, subsurface=medium)), resolution=16, out=tmp_path / "data")
+    assert not (tmp_path / "data").exists()
+
+
 def test_a_body_turned_inside_out_or_shared_is_refused() -> None:
     points, triangles = icosphere(1)
     milk, stone = Material("milk", (1.0,) * 3, subsurface=MILK), Material("stone", (0.5,) * 3)

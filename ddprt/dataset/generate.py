@@ -29,6 +29,7 @@ from ddprt.lights import Lighting, lighting_json
 from ddprt.progress import Progress
 from ddprt.sampling.points import Samples, load_samples, place_samples
 from ddprt.scene.atlas import Atlas
+from ddprt.scene.checks import check_materials
 from ddprt.scene.mesh import Scene
 from ddprt.scene.own_charts import charted
 from ddprt.sections import PointsConfig
@@ -98,6 +99,7 @@ def bake(
         config = checked({"seed": given.get("seed", 0), "atlas": atlas, "transport": transport})
     elif given:
         raise UserError(f"bake: got {' and '.join(given)} beside a config, expected one or the other; set it in the config")
+    check_materials(scene)
     if isinstance(lightings, str):
         if lightings != "active":
             raise UserError(f'bake: got lightings "{lightings}", expected a list, splits, "active" or none')

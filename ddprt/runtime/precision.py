@@ -97,7 +97,7 @@ def shipped_bytes(model: Model, precision: str) -> int:
         rest = relighter.matrix.size + relighter.offset.size + relighter.intercept.size
         return int(size * maps + 4 * (rest + len(relighter.basis)))
     leaves = [(leaf, axis) for leaf in jax.tree.leaves(relighter) if (axis := _along(leaf, len(model.area))) is not None]
-    scales = 0 if precision == "float" else sum(leaf.size // leaf.shape[axis] for leaf, axis in leaves)
+    scales = 0 if precision == "float" else sum(len(_maps(np.asarray(leaf), axis)) for leaf, axis in leaves)
     return int(relighter.nbytes - sum((leaf.dtype.itemsize - size) * leaf.size for leaf, _ in leaves) + 4 * scales)
 
 
@@ -112,8 +112,22 @@ def _leaf(leaf: np.ndarray, texels: int, rounding: Rounding) -> np.ndarray:
     axis = _along(leaf, texels)
     if axis is None:
         return leaf
+    rounded = _by_rows(_maps(leaf, axis), rounding)
+    if _coloured(leaf, axis):
+        return rounded.reshape(leaf.shape)
     last = np.moveaxis(leaf, axis, -1)
-    return np.moveaxis(_by_rows(last.reshape(-1, last.shape[-1]), rounding).reshape(last.shape), -1, axis)
+    return np.moveaxis(rounded.reshape(last.shape), -1, axis)
+
+
+def _maps(leaf: np.ndarray, axis: int) -> Float[np.ndarray, "maps entries"]:
+    """Maps as rows, each with its colours: a texture's scale is that of all of them."""
+    if _coloured(leaf, axis):
+        return leaf.reshape(-1, 3 * leaf.shape[axis])
+    return np.moveaxis(leaf, axis, -1).reshape(-1, leaf.shape[axis])
+
+
+def _coloured(leaf: np.ndarray, axis: int) -> bool:
+    return axis == leaf.ndim - 2 and leaf.shape[-1] == 3
 
 
 def _by_rows(rows: Float[np.ndarray, "rows entries"], rounding: Rounding) -> Float[np.ndarray, "rows entries"]:

@@ -140,6 +140,18 @@ def checked(
     )
 
 
+def check_materials(scene: Scene) -> None:
+    """Makes sure of what `checked` does of materials: those of a scene may have been changed since.
+
+    Raises:
+      UserError: impossible values, or a medium that is not shut in.
+    """
+    for entry in scene.materials:
+        _reflects(scene.name, entry, scene.uv)
+    if any(entry.subsurface for entry in scene.materials):
+        _holds_media(scene.name, welded(scene.positions)[scene.triangles], scene.corners, scene.material, scene.materials)
+
+
 def vertex_normals(
     positions: Float[np.ndarray, "vertices 3"], triangles: Int[np.ndarray, "triangles 3"]
 ) -> Float[np.ndarray, "vertices 3"]:

@@ -152,7 +152,7 @@ def _from_text(name: str, data: bytes) -> Strands:
     points, radii, shares = list[tuple[float, ...]](), list[float](), list[int]()
     starts, colours, ends = list[int](), list[tuple[float, ...]](), list[tuple[float, float]]()
     colour: tuple[float, ...] = COLOUR
-    root, tip, line = RADIUS, RADIUS, 0
+    root, tip, line, text = RADIUS, RADIUS, 0, ""
     try:
         for line, text in enumerate(data.decode("utf-8").splitlines(), 1):  # noqa: B007 (told where it stops)
             words = text.partition("#")[0].split()
@@ -174,10 +174,12 @@ def _from_text(name: str, data: bytes) -> Strands:
                 points.append((x, y, z))
                 radii.append(own[0] if own else np.nan)
                 shares.append(len(starts) - 1)
+    except UnicodeDecodeError:
+        raise UserError(f"{name}: got bytes that are no text, expected lines of it; write it again, or name it .hair") from None
     except ValueError:
         raise UserError(
-            f"{name}, line {line}: expected radius and one or two numbers, colour and three, strand, or a point of three or "
-            "four after a strand; mend the file"
+            f'{name}, line {line}: got "{text.strip()[:40]}", expected radius and one or two numbers, colour and '
+            "three, strand, or a point of three or four after a strand; mend the file"
         ) from None
     start = np.array([*starts, len(points)], np.int64)
     owner, radius = np.array(shares, np.int64), np.array(radii, np.float64)

@@ -72,6 +72,8 @@ class Contest:
           UserError: the baseline cannot be fitted, no such method, or the file cannot be written.
         """
         self._known = known(self.folder / RESULTS, self.progress)
+        for left in self.folder.glob(".fit-*"):  # of one that was killed
+            shutil.rmtree(left, ignore_errors=True)
         names, seeds = rivals(self.config), range(self.config.leagues.seeds)
         searches = {(name, seed): trials_of(self.config, name, seed) for name in names for seed in seeds}
         first = [self._tried(searches[BASELINE, seed][0]) for seed in seeds]
