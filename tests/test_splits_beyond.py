@@ -125,3 +125,12 @@ def test_light_that_does_not_get_in_is_told_and_a_method_that_cannot_too(tmp_pat
     assert by_name[BASELINE] is None
     assert "got a light of type point" in by_name["sh-prt"]
     assert isinstance(data.lightings[0][0], PointLight)
+
+
+def test_a_refusal_is_told_once_under_its_table() -> None:
+    rows = [("svd-ridge", ["3 %", "4 %"]), ("sh-prt", ["sh-prt: takes suns", "sh-prt: takes suns"])]
+    split = {"name": "kind", "question": "?", "cannot": "", "sides": ["a", "b"], "rows": rows, "words": ["b: nobody."]}
+    text = markdown([split], "box")
+    assert "| sh-prt | – | – |\n" in text
+    assert text.count("sh-prt: takes suns") == 1
+    assert text.endswith("- b: nobody.\n- sh-prt: takes suns\n")

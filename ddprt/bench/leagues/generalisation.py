@@ -262,6 +262,9 @@ def markdown(splits: Sequence[Mapping[str, Any]], title: str) -> str:
             lines += [f"Cannot be done here: {split['cannot']}.", ""]
             continue
         lines += ["| method | " + " | ".join(split["sides"]) + " |", "|" + " --- |" * (1 + len(split["sides"]))]
-        lines += [f"| {name} | " + " | ".join(cells) + " |" for name, cells in split["rows"]]
-        lines += ["", *(f"- {line}" for line in split["words"]), ""]
+        refused = {cell: "–" for name, cells in split["rows"] for cell in cells if cell.startswith(f"{name}: ")}
+        lines += [
+            f"| {name} | " + " | ".join(refused.get(cell, cell) for cell in cells) + " |" for name, cells in split["rows"]
+        ]
+        lines += ["", *(f"- {line}" for line in (*split["words"], *refused)), ""]
     return "\n".join(lines)
