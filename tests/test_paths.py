@@ -270,8 +270,8 @@ def test_roulette_of_shadow_rays_changes_no_mean(
     share: float, cornell: Scene, cornell_atlas: Atlas, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """None at all, and so much that most light is left to it."""
-    monkeypatch.setattr(shading, "_aim", getattr(shading._aim, "py_func", shading._aim))
-    monkeypatch.setattr(shading, "_FAINT", share)
+    aim = shading._aim
+    monkeypatch.setattr(shading, "_aim", lambda faint, *given: aim(share, *given))
     chosen = np.arange(0, cornell_atlas.count, 40)
     area = np.zeros(cornell_atlas.count)
     area[chosen] = cornell_atlas.area[chosen]

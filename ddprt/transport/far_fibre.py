@@ -35,6 +35,7 @@ _ROOTS = 513  # of the product of both cosines, where the longitudinal part is t
 _FINE = 16.0  # steps of the turn, and of the sum over h, for a scale of the azimuthal part of 1
 _LEAST, _MOST = 64, 768  # of these
 _RECORD = 32  # numbers of a vertex
+_FAINT = 8.0  # as `walk.FAINT`: shadow rays are most of the work in fur (docs/effects.md, Hair)
 _NOTHING = np.float32(-0.75)  # a 32nd of an exponent below which a lobe stays 6e-11 of its peak
 _ALONG = np.float32(1e-12)  # light along a fibre has no turn
 
@@ -182,7 +183,7 @@ class FarVertices:
         if len(close):
             local = np.einsum("nij,nj->ni", self.record[close, :9].reshape(-1, 3, 3), directions[close])
             throughput[:, close] = (self.record[close, 29:] * fibre.phase(self.held[close], self.shape, local)).T
-        return Vertices(place, throughput, self.there.owner)
+        return Vertices(place, throughput, self.there.owner, _FAINT)
 
 
 def _scaled_bessel(x: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:

@@ -14,8 +14,6 @@ from ddprt.transport.direct import centred
 from ddprt.transport.embree import Tracer
 from ddprt.transport.walk import Meetings
 
-_FAINT = 2.0  # times the mean of a block: weaker light gets a shadow ray in proportion to its strength
-
 Lamp = tuple[Light, Float32[np.ndarray, "3"]]
 """A light in the centred frame, and where its random numbers start."""
 
@@ -50,7 +48,9 @@ def shade(
             arriving_from = sample.direction.T, sample.distance, sample.strength
             lit = there.lit_from(sample.direction)
             chance = lit.brightness, numbers[2], start[2]
-            rays = _aim(lit.place, *arriving_from, tracer.offset, *chance, weight, target, origins, directions, reach)
+            rays = _aim(
+                lit.faint, lit.place, *arriving_from, tracer.offset, *chance, weight, target, origins, directions, reach
+            )
             if rays:
                 seen = tracer.unoccluded(origins[:rays], directions[:rays], reach[:rays])
                 arriving = seen, target, weight, lit.throughput, lit.owner, sample.colour, total
@@ -74,6 +74,7 @@ def shift(light: Light) -> Float32[np.ndarray, "3"]:
 
 @compiled
 def _aim(
+    faint: float,
     place: np.ndarray,
     direction: np.ndarray,
     distance: np.ndarray,
@@ -90,7 +91,8 @@ def _aim(
 ) -> int:
     """Weighs each vertex's light by its cosine, and writes a ray for each that is chosen; returns their number.
 
-    What is fainter than the mean is chosen as often as its share of it, and weighs the more. Rays stop `short` of the light.
+    What is fainter than `faint` times the mean is chosen as often as its share of that, and weighs the more. Rays stop `short`
+    of the light.
     """
     zero, one = np.float32(0), np.float32(1)
     total = 0.0
@@ -99,7 +101,7 @@ def _aim(
         weight[i] = cosine * strength[i] if cosine > zero else zero
     for i in range(len(weight)):
         total += weight[i] * brightness[i]
-    threshold = np.float32(_FAINT * total / len(weight))
+    threshold = np.float32(faint * total / len(weight))
     if not threshold < np.inf:  # too much for float32: infinity goes through, and is refused where light is stored
         threshold = zero
     rays = 0

@@ -20,6 +20,9 @@ from ddprt.transport.gather import Receivers
 SURVIVAL = 2.0
 """Times the throughput: chance to go on. Bounces are cheap beside the shadow rays of all lights."""
 
+FAINT = 2.0
+"""Times the mean of a block: weaker light gets a shadow ray in proportion to its strength."""
+
 MAX_SURVIVAL = 0.999
 """A white closed room would never let a path go; a lower cap has no finite variance above its root."""
 
@@ -44,11 +47,13 @@ class Vertices:
       place: origins of shadow rays (x, y, z; centred frame, metres) and unit geometric normals.
       throughput: what a receiver gains for each W/m² of light that arrives here, per channel.
       owner: the receiver.
+      faint: see `FAINT`.
     """
 
     place: Float32[np.ndarray, "6 n"]
     throughput: Float32[np.ndarray, "3 n"]
     owner: Int32[np.ndarray, " n"]
+    faint: float = FAINT
 
     @cached_property
     def brightness(self) -> Float32[np.ndarray, " n"]:
@@ -72,7 +77,8 @@ class Vertices:
     def joined(cls, parts: "Sequence[Vertices]") -> "Vertices":
         """One list of many."""
         columns = zip(*((part.place, part.throughput, part.owner) for part in parts), strict=True)
-        return cls(*(np.concatenate(column, axis=-1) for column in columns))
+        place, throughput, owner = (np.concatenate(column, axis=-1) for column in columns)
+        return cls(place, throughput, owner)
 
     def blocks(self) -> "Iterator[Vertices]":
         """Parts of about equal size that fit into a core's cache."""
