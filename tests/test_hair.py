@@ -194,6 +194,7 @@ def job(**changes: Any) -> Config:
     return checked({**base, **{key: {**base.get(key, {}), **value} for key, value in changes.items()}})
 
 
+@pytest.mark.slow
 def test_a_bake_keeps_what_leaves_fibres(fur: Scene, tmp_path: Path) -> None:
     data = ddprt.bake(fur, config=job(), out=tmp_path / "a")
     assert data.description["exitant"] == ["fur"]

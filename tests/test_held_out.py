@@ -52,6 +52,7 @@ def drawn(held_out: HeldOut) -> list[str]:
     return [repr(each.data.lightings[index]) for each in yardsticks for index in each.held_out]
 
 
+@pytest.mark.slow
 def test_each_time_there_are_more_of_the_same_density(workshop: Workshop, fitted: Fitted) -> None:
     held_out = HeldOut(workshop)
     assert held_out.count == 4

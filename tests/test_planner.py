@@ -75,6 +75,7 @@ def budgets(count: int, room: tuple[float, float]) -> list[dict[str, float]]:
     return found
 
 
+@pytest.mark.slow
 def test_budgets_with_room_are_met_in_few_trials() -> None:
     found = [search(limits) for limits in budgets(10, (1.25, 1.6))]
     assert sum(answer == "meets" for answer, _, _ in found) >= 9, "the target of nine in ten, with a clock that is off by 10 %"

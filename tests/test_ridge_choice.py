@@ -421,6 +421,7 @@ def test_second_opinion_is_asked() -> None:
     assert SECOND_OPINION > 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ALL_METHODS)
 def test_methods_all_know_the_statuses(method: str) -> None:
     X, Y = room()
