@@ -282,6 +282,7 @@ FAULTS: dict[str, tuple[Callable[[Path], None], Options, str]] = {
     "no number": (lambda f: None, {"test": "some"}, "--test: got 'some'"),
     "lone positions": (_picture("position.exr", 1.0), {}, "got no --normal beside it"),
     "wide mesh": (lambda f: None, {"geometry": "room.obj"}, "expected square lightmaps"),
+    "darkness": (lambda f: np.save(f / "measured.npy", np.zeros((5, 2, 3))), {}, "measured.npy: got zeros alone"),
     "vectors": (lambda f: np.save(f / "measured.npy", np.ones((4, 2, 3))), {}, "got 4 lightings for 5 pictures"),
     "no light": (lambda f: shutil.rmtree(f / "indirect"), {}, "got no indirect light"),
     "cut short": (lambda f: (f / "direct/0.exr").write_bytes((f / "direct/0.exr").read_bytes()[:200]), {}, "not a whole EXR image"),  # noqa: E501

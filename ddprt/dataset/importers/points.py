@@ -103,7 +103,7 @@ def read_vectors(path: Path) -> Float32[np.ndarray, "lightings points 3"]:
     """Measured values: .npy or .npz of (lightings, points, 3), or a .csv of a lighting per row, r, g, b of each point in turn.
 
     Raises:
-      UserError: missing, of another shape, not finite or negative.
+      UserError: missing, of another shape, not finite, negative, or dark.
     """
     try:
         if path.suffix.lower() == ".csv":
@@ -127,6 +127,10 @@ def read_vectors(path: Path) -> Float32[np.ndarray, "lightings points 3"]:
     if not np.isfinite(values).all() or values.min() < 0:
         row = int(np.argwhere(~(np.isfinite(values) & (values >= 0)))[0][0])
         raise UserError(f"{path}: got a negative or infinite value, or NaN, in lighting {row}, expected light; mend it")
+    if not values.any():
+        raise UserError(
+            f"{path}: got zeros alone, expected measured light, which tells lightings apart; check what was written"
+        )
     return values
 
 
