@@ -100,7 +100,7 @@ class Config(Section):
         """The resolved configuration as TOML, accepted as input again; of a file that will lie in `folder`, if one is given."""
         document = self.model_dump(mode="json")
         if folder:
-            _move(document, lambda path: _seen_from(path, folder))
+            _move(document, lambda path: seen_from(path, folder))
         lines = [f"seed = {document.pop('seed')}"]
         for section, values in document.items():
             lines += ["", f"[{section}]", *(f"{key} = {_toml(value)}" for key, value in values.items())]
@@ -134,7 +134,7 @@ def load_config(path: str | Path | None, overrides: dict[str, str] | None = None
                 f"{path}: got text that is not TOML ({error}), expected [section] and key = value; mend it"
             ) from None
         folder = Path(path).parent
-        _move(document, lambda path: _seen_from(str(folder / path), Path()))
+        _move(document, lambda path: seen_from(str(folder / path), Path()))
     overrides = {_as_written(dotted): text for dotted, text in (overrides or {}).items()}
     for dotted, text in overrides.items():
         check_key(dotted)
@@ -240,7 +240,7 @@ def _move(document: dict[str, Any], move: Callable[[str], str]) -> None:
                 table[key] = moved(dotted, table[key])
 
 
-def _seen_from(path: str, folder: Path) -> str:
+def seen_from(path: str, folder: Path) -> str:
     """A path as it counts from a folder, through whatever links lead to either; absolute ones stay."""
     if os.path.isabs(path):
         return path

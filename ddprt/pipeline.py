@@ -15,7 +15,8 @@ from ddprt.dataset.forecast import Forecast, forecast
 from ddprt.dataset.forecast_effects import belongs
 from ddprt.dataset.generate import bake
 from ddprt.dataset.importers.places import stored_scene
-from ddprt.dataset.sameness import check_skies, other_settings
+from ddprt.dataset.light_files import check_skies
+from ddprt.dataset.sameness import other_settings
 from ddprt.dataset.store import Dataset, open_dataset
 from ddprt.errors import UserError
 from ddprt.files import make_folder, write_text
@@ -140,7 +141,7 @@ class Run:
                 f'"{self.scene.name}" as configured now; bake again into another --out'
             )
         if shines:
-            check_skies(data.description, data.lightings)
+            check_skies(data.description, data.lightings, data.folder)
         return data
 
     def fit(self, data: Dataset) -> tuple[dict[str, Any], dict[str, float]]:

@@ -17,15 +17,16 @@ from ddprt.config import Config, checked
 from ddprt.dataset import store
 from ddprt.dataset.denoise import find_denoiser
 from ddprt.dataset.indirect import IndirectBake
+from ddprt.dataset.light_files import kept, pictures
 from ddprt.dataset.manifest import Manifest, map_name
 from ddprt.dataset.probes import probe_layers
-from ddprt.dataset.sameness import baked_settings, counts, differences, pictures
+from ddprt.dataset.sameness import baked_settings, counts, differences
 from ddprt.dataset.scratch import remove_left
 from ddprt.dataset.splits import Once, Splits, check_choice, choose_lightings, chosen, doubt, grouped
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.files import alone_in, write_tensors
-from ddprt.lights import Lighting, lighting_json
+from ddprt.lights import Lighting
 from ddprt.progress import Progress
 from ddprt.sampling.points import Samples, load_samples, place_samples
 from ddprt.scene.atlas import Atlas
@@ -141,8 +142,8 @@ def sunk(samples: Samples, lightings: Sequence[Lighting], config: PointsConfig, 
     return replace(samples, depth=depth * samples.spacing)
 
 
-def _records(entries: Sequence[tuple[str, Lighting]]) -> list[dict[str, Any]]:
-    return [{"split": split, "lights": lighting_json(lighting)} for split, lighting in entries]
+def _records(entries: Sequence[tuple[str, Lighting]], folder: Path) -> list[dict[str, Any]]:
+    return [{"split": split, "lights": kept(lighting, folder)} for split, lighting in entries]
 
 
 class _Bake:
@@ -197,7 +198,9 @@ class _Bake:
         active = self.config.lightings.choose == "active"
         if there is not None and not active:
             points = {"points": self._points(listed)} if listed else {}
-            self._refuse_other(there, {"counts": counts(_records(entries)), "lightings": _records(entries), **points})
+            self._refuse_other(
+                there, {"counts": counts(_records(entries, self.folder)), "lightings": _records(entries, self.folder), **points}
+            )
         with self.progress.stage("atlas") as stage:
             size = self.config.atlas
             atlas, hidden = build_open_atlas(self.tracer, scattering(self.scene), size.resolution, size.padding)
@@ -262,8 +265,8 @@ class _Bake:
             "points": self._points(samples),
             "plan": [asdict(effect) for effect in effects.effects],
             "drawn": drawn,
-            "lightings": _records(entries),
-            **({"skies": skies} if (skies := pictures([lighting for _, lighting in entries])) else {}),
+            "lightings": _records(entries, self.folder),
+            **({"skies": skies} if (skies := pictures([lighting for _, lighting in entries], self.folder)) else {}),
         }
 
     def _exitant(self) -> list[str]:

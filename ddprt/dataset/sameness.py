@@ -9,9 +9,7 @@ from ddprt.config import Config
 from ddprt.dataset.gloss import gloss_layers
 from ddprt.dataset.probes import probe_layers
 from ddprt.dataset.splits import SPLITS
-from ddprt.errors import UserError
 from ddprt.files import sha256
-from ddprt.lights import EnvironmentLight, Lighting
 from ddprt.scene.mesh import Scene
 from ddprt.transport.glossiness import valid_integrator
 
@@ -55,31 +53,6 @@ def differences(description: dict[str, Any], wanted: dict[str, Any]) -> str:
         _compare(_SAID.get(key, key), one, other, lines)
     more = [f"and {len(lines) - _TOLD} more"] if len(lines) > _TOLD else []
     return "; ".join(lines[:_TOLD] + more)
-
-
-def pictures(lightings: Sequence[Lighting]) -> dict[str, str]:
-    """Digests of the files that skies are read from: a picture that has changed makes another dataset."""
-    names = {light.image for lighting in lightings for light in lighting if isinstance(light, EnvironmentLight)}
-    return {name: sha256(Path(name)) for name in sorted(names) if Path(name).is_file()}
-
-
-def check_skies(description: dict[str, Any], lightings: Sequence[Lighting]) -> None:
-    """Makes sure that the skies of a dataset can shine again, and as they did.
-
-    Raises:
-      UserError: a file that is missing, or another one than was baked with.
-    """
-    names = {light.image for lighting in lightings for light in lighting if isinstance(light, EnvironmentLight)}
-    found, before = pictures(lightings), description.get("skies", {})
-    for name in sorted(names):
-        from ddprt.lights.panorama import stamp  # most datasets have no sky
-
-        stamp(name)
-        if found.get(name) != before.get(name, found.get(name)):
-            raise UserError(
-                f"environment.image {name}: got another picture than the dataset was baked with, expected the same; put that "
-                "back, or bake again into another --out"
-            )
 
 
 def _of_weight(entries: Any) -> Any:

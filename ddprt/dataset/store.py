@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from ddprt.axes import Bool, Float32, Float64
+from ddprt.dataset.light_files import lit
 from ddprt.dataset.manifest import Manifest, layer_name, map_name
 from ddprt.dataset.pack import Pack, Shelf, Stored, remove_packs
 from ddprt.errors import UserError
@@ -55,7 +56,7 @@ class Dataset:
     def lightings(self) -> tuple[Lighting, ...]:
         """All lightings, by index."""
         return tuple(
-            parse_lighting(entry["lights"], f"lightings[{i}]") if entry["lights"] or not self.imported else ()
+            parse_lighting(lit(entry["lights"], self.folder), f"lightings[{i}]") if entry["lights"] or not self.imported else ()
             for i, entry in enumerate(self.description["lightings"])
         )
 

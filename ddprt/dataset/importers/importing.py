@@ -20,11 +20,11 @@ from ddprt.dataset.importers.points import Chosen, choose_points, nowhere
 from ddprt.dataset.importers.quantities import QUANTITIES, Quantity, irradiance
 from ddprt.dataset.importers.recipe import Recipe
 from ddprt.dataset.importers.sources import Shots, find_shots
+from ddprt.dataset.light_files import kept
 from ddprt.dataset.manifest import Manifest, map_name
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
 from ddprt.files import alone_in, sha256, write_tensors
-from ddprt.lights import lighting_json
 from ddprt.progress import Progress
 from ddprt.sampling.points import Samples
 from ddprt.transport.embree import Tracer
@@ -231,7 +231,7 @@ class _Import:
             "points": {"count": len(samples.position), "digest": samples.digest},
             "plan": [],
             "lightings": [
-                {"name": name, "split": split, "lights": lighting_json(lighting)}
+                {"name": name, "split": split, "lights": kept(lighting, self.out)}
                 for name, split, lighting in zip(self.shots.names, self.shots.splits, self.shots.lightings, strict=True)
             ],
         }
