@@ -80,6 +80,7 @@ def measured(monkeypatch: pytest.MonkeyPatch, swept: tuple[Path, list[str], list
 FAILING = ["points.count = 5000", "scene.name = plates"]
 
 
+@pytest.mark.slow
 def test_every_setting_is_noted_once(swept: tuple[Path, list[str], list[Path]]) -> None:
     lines = [json.loads(line) for line in (swept[0] / RESULTS).read_text().splitlines()]
     settings = settings_of(base(sweep=SWEEP))
@@ -89,6 +90,7 @@ def test_every_setting_is_noted_once(swept: tuple[Path, list[str], list[Path]]) 
         assert bool(line["failed"]) == bool(set(line["changes"]) & FAIL), line["failed"]
 
 
+@pytest.mark.slow
 def test_reasons_of_failures_are_kept(swept: tuple[Path, list[str], list[Path]]) -> None:
     failed = {record["name"]: record["failed"] for record in read_results(swept[0] / RESULTS).values() if record["failed"]}
     assert sorted(failed) == FAILING
@@ -96,6 +98,7 @@ def test_reasons_of_failures_are_kept(swept: tuple[Path, list[str], list[Path]])
     assert 'points.count: got 5000, but "cornell" covers' in failed["points.count = 5000"]
 
 
+@pytest.mark.slow
 def test_bases_beyond_the_rank_are_no_failure(swept: tuple[Path, list[str], list[Path]]) -> None:
     found = {record["name"]: record for record in read_results(swept[0] / RESULTS).values()}
     many = found["fit.bases = 400"]
@@ -104,6 +107,7 @@ def test_bases_beyond_the_rank_are_no_failure(swept: tuple[Path, list[str], list
     assert found["fit.method = nearest"]["coefficients"] is None
 
 
+@pytest.mark.slow
 def test_equal_datasets_are_baked_once_and_go_afterwards(swept: tuple[Path, list[str], list[Path]]) -> None:
     folder, baked, files = swept
     settings = settings_of(base(sweep=SWEEP))
@@ -122,16 +126,19 @@ def test_kept_datasets_stay(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "datasets").iterdir()] == [settings_of(config)[0].bake_digest]
 
 
+@pytest.mark.slow
 def test_nothing_is_measured_twice(again: Path, measured: list[str]) -> None:
     quiet(base(sweep=SWEEP), again)
     assert sorted(measured) == FAILING, "only what failed is tried again"
 
 
+@pytest.mark.slow
 def test_a_sweep_of_more_repeats_is_measured_anew(again: Path, measured: list[str]) -> None:
     quiet(base(sweep={"fit.bases": (2,)}, bench__repeats=2), again)
     assert measured == ["as configured", "fit.bases = 2"]
 
 
+@pytest.mark.slow
 def test_other_sweeps_find_theirs(again: Path, measured: list[str]) -> None:
     quiet(base(sweep={"fit.bases": (2,)}), again)
     assert measured == []
@@ -147,6 +154,7 @@ def edited(path: Path, name: str, change: Callable[[dict[str, Any]], Any]) -> No
     path.write_text("".join(json.dumps(record) + "\n" for record in records))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
     [
@@ -185,12 +193,14 @@ def test_what_does_not_compare_is_measured_anew(again: Path, measured: list[str]
     assert not read_results(again / RESULTS)[settings_of(base(sweep=SWEEP))[1].digest]["failed"], "the last one counts"
 
 
+@pytest.mark.slow
 def test_a_finer_atlas_has_all_scored_on_its_truth(again: Path, measured: list[str]) -> None:
     with pytest.raises(KeyError):  # the finer setting itself is not in the sweep that stands in for measuring
         quiet(base(sweep={"fit.bases": (2,), "atlas.resolution": (48,)}), again)
     assert measured[:2] == ["as configured", "fit.bases = 2"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cut", [1, 40, -1])
 def test_a_line_that_was_cut_is_measured_anew(again: Path, measured: list[str], cut: int) -> None:
     path = again / RESULTS
@@ -204,6 +214,7 @@ def test_a_line_that_was_cut_is_measured_anew(again: Path, measured: list[str], 
     assert len(read_results(path)) == len(whole) + 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", ["null", "[]", '"digest"', "{}", '{"digest": []}', '{"digest": "x"', "\x00", "[" * 10**5])
 def test_lines_that_are_no_records_are_passed_over_and_counted(
     again: Path, text: str, capsys: pytest.CaptureFixture[str]
@@ -218,6 +229,7 @@ def test_lines_that_are_no_records_are_passed_over_and_counted(
     assert capsys.readouterr().err == f"{RESULTS}: {len(whole)} of {len(whole) + 1} lines are whole; the others do not count\n"
 
 
+@pytest.mark.slow
 def test_a_sweep_says_how_many_lines_do_not_count(again: Path, measured: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     edited(again / RESULTS, "fit.bases = 2", lambda record: record.pop("environment"))
     sweep(base(sweep={"fit.bases": (2,)}), again, Progress())
@@ -232,6 +244,7 @@ def test_results_that_cannot_be_read_are_told_not_overwritten(tmp_path: Path) ->
     assert (tmp_path / RESULTS).read_bytes() == b"\xff\xfe\n"
 
 
+@pytest.mark.slow
 def test_an_interrupted_sweep_keeps_what_it_has(again: Path, measured: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     (again / RESULTS).unlink()
     note = Workshop.measure
@@ -252,6 +265,7 @@ def test_an_interrupted_sweep_keeps_what_it_has(again: Path, measured: list[str]
     assert measured[:2] == first
 
 
+@pytest.mark.slow
 def test_too_little_memory_is_a_failure_like_others(again: Path, measured: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     edited(again / RESULTS, "fit.bases = 2", lambda record: record.update(schema=0))
 
@@ -264,6 +278,7 @@ def test_too_little_memory_is_a_failure_like_others(again: Path, measured: list[
     assert failed == "got too little memory, expected enough for this setting; lower it"
 
 
+@pytest.mark.slow
 def test_two_sweeps_at_once_are_one_too_many(again: Path, measured: list[str]) -> None:
     with alone_in(again), pytest.raises(UserError, match="working in this folder; wait for it"):
         quiet(base(sweep=SWEEP), again)

@@ -209,6 +209,7 @@ def whole() -> dict[str, Any]:
     return json.loads(answer.stdout.splitlines()[-1])
 
 
+@pytest.mark.slow
 def test_the_record_says_who_is_missing_and_what_to_do(whole: dict[str, Any]) -> None:
     skipped = {
         row["name"]: row["reason"]
@@ -227,6 +228,7 @@ def test_the_record_says_who_is_missing_and_what_to_do(whole: dict[str, Any]) ->
     assert all(f"skipped: {reason}" in whole["table"] for reason in skipped.values())
 
 
+@pytest.mark.slow
 def test_the_record_holds_what_a_claim_needs(whole: dict[str, Any]) -> None:
     record = whole["record"]
     assert record["threads"] == roofline.threads()
@@ -262,6 +264,7 @@ def test_the_record_holds_what_a_claim_needs(whole: dict[str, Any]) -> None:
     assert "5 models in turn" in record["comparisons"][2]["what"]
 
 
+@pytest.mark.slow
 def test_the_table_shows_every_row(whole: dict[str, Any]) -> None:
     rows = [row for entry in whole["record"]["comparisons"] for row in entry["rows"]]
     lines = whole["table"].splitlines()
