@@ -3,8 +3,9 @@
 Question: who wins the leagues of bytes, operations and seconds on each scene, and who generalises; does a linear autoencoder
           find the SVD's subspace, is an interrupted training resumed to the same bits, and how near is training to what
           the machine can do?
-Command:  python experiments/learned.py [SCENE ...] [--out runs/learned]      cornell, corridor and statue unless named; goes on
-                                                                              where it was stopped; the last line is JSON
+Command:  python experiments/learned.py [SCENE ...] [--out runs/learned]      all four scenes unless named; goes on where it was
+                                                                              stopped; the last line is JSON
+          python experiments/learned.py size [SCENE ...] [--out runs/learned] errors from 8 to 1024 training lightings
           python experiments/learned.py --quick                               tiny data and defaults alone, less than a minute
 Answer:   docs/leagues.md
 
@@ -16,7 +17,7 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,26 +42,29 @@ from ddprt.pipeline import Run
 from ddprt.training.journal import keeping
 
 UPPER = {"region_low": [0.1, 0.5, 0.1], "region_high": [0.9, 0.8, 0.9], "clearance": 0.1}
+AROUND = {"distribution": "around", "kinds": ["point", "directional"]}
 SCENES: dict[str, dict[str, Any]] = {
     "cornell": UPPER,
     "corridor": {},
-    "statue": {"distribution": "around", "kinds": ["point", "directional"]},
+    "statue": AROUND,
+    "statue-marble": AROUND,
 }
+MANY = {"train": 1024, "validation": 64}  # lightings of the curve over data size
 OPEN = 10**15  # a budget that everybody keeps
 
 
-def config(scene: str, quick: bool) -> Config:
-    """The job of a scene."""
+def config(scene: str, quick: bool, **counts: int) -> Config:
+    """The job of a scene; `counts` of lightings may differ."""
     lightings = {"train": 18, "validation": 4, "test": 8} if quick else {"train": 64, "validation": 16, "test": 32}
     document: dict[str, Any] = {
         "scene": {"name": scene},
-        "atlas": {"resolution": 32 if quick else 64},
-        "lightings": {**lightings, **SCENES.get(scene, {})},
-        "points": {"count": 32 if quick else 128, "supersample": 4 if quick else 8},
+        "atlas": {"resolution": 32 if quick else 48},
+        "lightings": {**lightings, **SCENES.get(scene, {}), **counts},
+        "points": {"count": 32 if quick else 64, "supersample": 4 if quick else 8},
         "transport": {"samples": 32, "test_samples": 256} if quick else {"target_noise": 0.01},
         "fit": {"bases": 8 if quick else 16},
         "bench": {"repeats": 1 if quick else 5},
-        "leagues": {"trials": 1, "bytes": OPEN, "flops": OPEN, "seconds": 1e9} if quick else {"seconds": 60.0},
+        "leagues": {"trials": 1, "bytes": OPEN, "flops": OPEN, "seconds": 1e9} if quick else {"seconds": 20.0},
     }
     if quick:
         few = {"steps": 40, "check_every": 20}
@@ -142,45 +146,68 @@ def keep_compiled() -> None:
 def scene(name: str, folder: Path, quick: bool) -> tuple[dict[str, list[Place]], Dataset, list[str]]:
     """Leagues of a scene and, unless it is to be quick, its splits."""
     job = Run(config(name, quick), folder, quiet=quick)
-    data, found = job.bake(), list[Mapping[str, Any]]()
+    data, found = job.bake(), list[dict[str, Any]]()
     if not quick:
-        names = [*SPLITS]
-        found = told(Generalisation(job.config, data, job.scene, folder / "bench", job.progress).run(names), names)
-        write_text(folder / "bench" / "splits.md", markdown(found, name))
+        found = generalised(job, data, [split for split in SPLITS if split != "size"])
     table, files = leagues(job.config, data, job.scene, folder / "bench", job.progress, splits=found)
     if not quick:
         print(files[1].read_text(), flush=True)
     return table, data, [f"{split['name']}: {line}" for split in found for line in split["words"]]
 
 
-def main(words: Sequence[str]) -> None:
-    keep_compiled()
-    quick, begun = "--quick" in words, time.perf_counter()
-    named = [word for at, word in enumerate(words) if not word.startswith("--") and words[at - 1 : at] != ["--out"]]
+def generalised(job: Run, data: Dataset, names: Sequence[str]) -> list[dict[str, Any]]:
+    """What came out of some splits; also in splits.md."""
+    bench = job.folder / "bench"
+    found = told(Generalisation(job.config, data, job.scene, bench, job.progress).run(names), names)
+    write_text(bench / "splits.md", markdown(found, job.config.scene.name))
+    return found
+
+
+def size(names: Sequence[str], out: Path) -> None:
+    """The curve over data size of each scene, with many lightings of its own."""
+    for name in names:
+        job = Run(config(name, quick=False, **MANY), out / f"{name}-size")
+        generalised(job, job.bake(), ["size"])
+        print((job.folder / "bench" / "splits.md").read_text(), flush=True)
+
+
+def compared(names: Sequence[str], out: Path, quick: bool) -> dict[str, Any]:
+    """Leagues and splits of each scene, and what of training is measured once, for the JSON."""
+    begun, found, first = time.perf_counter(), dict[str, dict[str, Any]](), None
+    for name in names:
+        table, data, splits = scene(name, out / name, quick)
+        by_name = {place.method: numbers(place) for place in table["seconds"]}
+        wins = {league: [place.method for place in places if place.difference and place.difference.verdict == "better"]
+                for league, places in table.items()}  # fmt: skip
+        found[name] = {"methods": by_name, "wins": wins, "splits": splits}
+        print(f"{name}: after {time.perf_counter() - begun:.1f} s", flush=True)
+        first = first or data
+    assert first is not None
+    told = found[names[0]]["methods"]
     with tempfile.TemporaryDirectory(prefix="learned-") as scratch:
-        out = Path(words[words.index("--out") + 1]) if "--out" in words else Path("runs/learned")
-        found: dict[str, Any] = {}
-        first: Dataset | None = None
-        for name in named or (["cornell"] if quick else list(SCENES)):
-            table, data, splits = scene(name, Path(scratch) / name if quick else out / name, quick)
-            by_name = {place.method: numbers(place) for place in table["seconds"]}
-            wins = {league: [place.method for place in places if place.difference and place.difference.verdict == "better"]
-                    for league, places in table.items()}  # fmt: skip
-            found[name] = {"methods": by_name, "wins": wins, "splits": splits}
-            print(f"{name}: after {time.perf_counter() - begun:.1f} s", flush=True)
-            first = first or data
-        assert first is not None
-        told = next(iter(found.values()))
-        answer = {
-            "methods": {name: own for name, own in told["methods"].items() if name != BASELINE},
-            "baseline": told["methods"][BASELINE],
+        return {
+            "methods": {name: own for name, own in told.items() if name != BASELINE},
+            "baseline": told[BASELINE],
             "wins": {name: own["wins"] for name, own in found.items()} if not quick else {},
+            "splits": {name: own["splits"] for name, own in found.items()} if not quick else {},
             "subspace_angle_deg": round(subspace_angle(first, 8), 4),
-            "resume_bit_identical": resumes(first, Path(scratch) / "resumed"),
-            **pace(50 if quick else 1000, 3 if quick else 7),
+            "resume_bit_identical": resumes(first, Path(scratch)),
+            **pace(300 if quick else 1000, 3 if quick else 7),
             "seconds": round(time.perf_counter() - begun, 1),
         }
-        print(json.dumps(answer))
+
+
+def main(words: Sequence[str]) -> None:
+    keep_compiled()
+    named = [word for at, word in enumerate(words) if not word.startswith("--") and words[at - 1 : at] != ["--out"]]
+    out = Path(words[words.index("--out") + 1]) if "--out" in words else Path("runs/learned")
+    if named[:1] == ["size"]:
+        size(named[1:] or list(SCENES), out)
+    elif "--quick" in words:
+        with tempfile.TemporaryDirectory(prefix="learned-") as scratch:
+            print(json.dumps(compared(named or ["cornell"], Path(scratch), quick=True)))
+    else:
+        print(json.dumps(compared(named or list(SCENES), out, quick=False)))
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from ddprt.training.schedule import Schedule
 
 LIGHTINGS, GROUPS, POINTS, WIDTH, BASES = 128, 3, 128, 128, 16
 RATE, DECAY = 2e-3, 1e-4
+REST = 0.3  # seconds: threads of whoever went before may still be waiting for work, and take the cores while they do
 
 
 def made_up() -> Seen:
@@ -121,6 +122,7 @@ def pace(steps: int, turns: int) -> dict[str, float | str | None]:
     taken: dict[str, list[float]] = {name: [] for name in works}
     for _ in range(turns):
         for name, work in works.items():
+            time.sleep(REST)
             begun = time.perf_counter()
             work()
             taken[name].append(time.perf_counter() - begun)
