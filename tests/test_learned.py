@@ -1,6 +1,6 @@
 """Learned methods: what each is known to find, or to keep."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -146,6 +146,9 @@ class Sliced:
 
     def some(self, lightings: slice) -> jax.Array:
         raise AssertionError("whole maps were asked for")
+
+    def runs(self, starts: Sequence[int], texels: int) -> jax.Array:
+        raise AssertionError("runs of texels were asked for")
 
 
 def streamed(part: Examples) -> Examples:

@@ -93,8 +93,8 @@ class Seen(NamedTuple):
             stop = start + block.shape[1] * (3 // groups)
             targets = _projected(groups, targets, block, vectors[:, start:stop], entries[start:stop])
             start = stop
-        inputs, importance = _asked(groups, examples.frame.values, examples.scale)
-        return cls(inputs, targets, importance, jnp.ones(len(vectors)))
+        importance = importance_of(groups, examples.scale)
+        return cls(grouped(examples.frame.values, groups), targets, importance, jnp.ones(len(vectors)))
 
     @property
     def spread(self) -> Float[Array, " bases"]:
@@ -119,9 +119,10 @@ def _projected(groups: int, before: Array, light: Array, vectors: Array, entries
 
 
 @partial(jax.jit, static_argnums=0)
-def _asked(groups: int, values: Array, scale: Array) -> tuple[Array, Array]:
+def importance_of(groups: int, scale: Float[Array, "lightings 3"]) -> Float[Array, "lightings groups"]:
+    """Each lighting's share in squared errors of light, mean 1."""
     share = (scale[:, :groups] / jnp.maximum(jnp.max(scale), jnp.finfo(jnp.float32).tiny)) ** 2
-    return grouped(values, groups), share / jnp.maximum(jnp.mean(share), jnp.finfo(jnp.float32).tiny)
+    return share / jnp.maximum(jnp.mean(share), jnp.finfo(jnp.float32).tiny)
 
 
 @dataclass(frozen=True)

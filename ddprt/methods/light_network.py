@@ -268,6 +268,7 @@ class LightNetworks(Learned):
         "steps": (100, 300),
         "weight_decay": (0.0, 1e-4),
     }
+    streams: ClassVar[bool] = True
     space: Literal["linear"] = "linear"
     bases: int = Field(16, ge=1)
     ridge: Literal["auto"] | Annotated[float, Field(ge=0)] = "auto"

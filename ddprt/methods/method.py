@@ -58,6 +58,10 @@ class Maps(Protocol):
         """Whole maps of some lightings."""
         ...
 
+    def runs(self, starts: Sequence[int], texels: int) -> Float[Array, "lightings some 3"]:
+        """So many texels from each start on; after the last texel comes the first."""
+        ...
+
 
 @dataclass(frozen=True)
 class Examples:
@@ -160,7 +164,7 @@ class AsksForLights(Protocol):
 class Method(BaseModel):
     """Base of the methods' settings records; those that can learn from `Maps` say that they `streams`.
 
-    A Relighter of a method that streams is none that `AsksForLights`. A method with a field `space` fits in that space alone.
+    A method with a field `space` fits in that space alone.
     `search` says what `ddprt bench --leagues` may try: settings of the method (or "fit.KEY" of [fit]) and their choices; those
     of `bases` are meant for 16 and grow with the configuration's. A method without one runs with its defaults alone.
     """

@@ -20,13 +20,17 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Int
 from pydantic import Field
 
 from ddprt.fitting.basis import entry_weights, fit_basis
-from ddprt.methods.learned import Layers, Learned, Seen, dense_layers, gated, told
-from ddprt.methods.method import Examples, FitReport, Frame, array_bytes, as_pytree, columns, grouped, in_memory
+from ddprt.methods.learned import Layers, Learned, Seen, dense_layers, gated, importance_of, told
+from ddprt.methods.method import Examples, FitReport, Frame, Maps, array_bytes, as_pytree, columns, grouped
 from ddprt.methods.svd_ridge import LinearTransfer, transfer_to
+
+RUNS, RUN = 16, 1024  # of light on disk a round of training knows so many runs of so many texels
+CHECKED = 4  # times as many texels for looks at validation light on disk
 
 
 class Decoder(NamedTuple):
@@ -134,6 +138,7 @@ class NeuralMap(Learned):
         "learning_rate": (2e-3, 5e-3, 1e-2),
         "steps": (500, 2000),
     }
+    streams: ClassVar[bool] = True
     bases: int = Field(16, ge=1, description="features of a texel, each the baseline's basis texture to begin with")
     coefficients: int = Field(
         0, ge=0, description="numbers that tell of the light; 0: twice the bases, as many as them where it enters everywhere"
@@ -147,8 +152,7 @@ class NeuralMap(Learned):
     texels: int = Field(512, ge=1, description="of a step")
 
     def fit(self, train: Examples, validation: Examples, *, key: Array) -> NeuralLightmap:
-        """See `Method`."""
-        train, validation = (replace(part, indirect=in_memory(part.indirect)) for part in (train, validation))
+        """See `Method`: of light on disk each round of training sees other texels, drawn anew."""
         entries = jnp.asarray(entry_weights(train.area, train.weights, train.channels))  # type: ignore[arg-type]
         turned = self.light == "everywhere"
         count = self.coefficients or self.bases * (1 if turned else 2)
@@ -166,14 +170,19 @@ class NeuralMap(Learned):
             )
             return NeuralLightmap(matrix, jnp.zeros(0), basis.vectors, *none, linear.report)
         start = _by_texel(basis.vectors[:kept], groups)
-        seen, held = (_lit(part, linear, entries, basis.vectors) for part in (train, validation))
+        share = entries.reshape(-1, out) * entries.size
+        seen, held = (_lit(part, linear, start, share) for part in (train, validation))
         spread = Seen(seen.light, seen.light, seen.importance, jnp.ones(bases)).spread
         gain = spread[:kept]
-        seen, held = (part._replace(light=part.light / spread, start=start, gain=gain) for part in (seen, held))
-        rest = _left(seen)
+        seen, held = (part._replace(light=part.light / spread, gain=gain) for part in (seen, held))
+        draw = jax.random.fold_in(key, 0)
+        rest = _left(_looked_at(seen, train, draw, 0, CHECKED))
         seen, held = seen._replace(rest=rest), held._replace(rest=rest)
+        of_round = partial(_looked_at, seen, train, draw)
+        held = _looked_at(held, validation, draw, 0, CHECKED)
         problem = Decoding(self.width, self.depth, turned, self.lightings, self.texels)
-        trained = self.trained("neural-lightmap", problem, seen, held, key)
+        data = of_round if isinstance(train.indirect, Maps) else of_round(0)
+        trained = self.trained("neural-lightmap", problem, data, held, key)
         silent = trained.parameters._replace(features=start, head=jnp.zeros_like(trained.parameters.head))
         better = _check(problem, trained.parameters, held) < _check(problem, silent, held)
         chosen: Decoder = trained.parameters if better else silent
@@ -185,35 +194,47 @@ class NeuralMap(Learned):
 
 
 class Lit(NamedTuple):
-    """Lightings by their coefficients, and the light that they make.
+    """Lightings by their coefficients, and the light that they make at the texels that are looked at.
 
     Attributes:
       light: u, over its root mean square in training.
-      target: encoded indirect light.
       importance: of each lighting and group, mean 1: its share in squared errors of light.
-      share: of each entry of a map in them, mean 1.
-      start: features to begin with.
+      start: features of all texels to begin with.
+      share: of each entry of a map in squared errors, mean 1 over all of them.
+      at: which texels are looked at.
+      target: their encoded indirect light.
       gain: what u was divided by, for as many as there are features.
       rest: root mean square of what the baseline leaves of the training light.
     """
 
     light: Float[Array, "lightings groups bases"]
-    target: Float[Array, "lightings groups texels out"]
     importance: Float[Array, "lightings groups"]
-    share: Float[Array, "texels out"]
     start: Float[Array, "texels out features"]
+    share: Float[Array, "some out"]
+    at: Int[Array, " some"]
+    target: Float[Array, "lightings groups some out"]
     gain: Float[Array, " features"]
     rest: Float[Array, ""]
 
 
-def _lit(examples: Examples, linear: LinearTransfer, entries: Array, vectors: Array) -> Lit:
-    groups = len(linear.matrix)
-    rows = grouped(in_memory(examples.indirect), groups)
-    target = rows.reshape(*rows.shape[:2], -1, 3 // groups)
-    importance = Seen.of(examples, groups, vectors, entries).importance
-    share = entries.reshape(target.shape[2:]) * entries.size
-    nothing = jnp.zeros((*share.shape, 0))
-    return Lit(linear.coefficients(examples.frame), target, importance, share, nothing, jnp.zeros(0), jnp.ones(()))
+def _lit(examples: Examples, linear: LinearTransfer, start: Array, share: Array) -> Lit:
+    light = linear.coefficients(examples.frame)
+    target = jnp.zeros((*light.shape[:2], 0, share.shape[1]))
+    importance, none = importance_of(light.shape[1], examples.scale), jnp.zeros(0, jnp.int32)
+    return Lit(light, importance, start, share, none, target, jnp.zeros(0), jnp.ones(()))
+
+
+def _looked_at(lit: Lit, examples: Examples, key: Array, number: int, times: int = 1) -> Lit:
+    """With the light of a round: all of it, or of what stays on disk `times` as many runs of texels as usual, drawn anew."""
+    light, groups, whole = examples.indirect, lit.light.shape[1], len(lit.share)
+    if isinstance(light, Maps):
+        run = min(RUN, whole)
+        starts = jax.random.randint(jax.random.fold_in(key, number), (min(times * RUNS, -(-whole // run)),), 0, whole)
+        at, some = (starts[:, None] + jnp.arange(run)).reshape(-1) % whole, light.runs(np.asarray(starts).tolist(), run)
+    else:
+        at, some = jnp.arange(whole), light
+    rows = grouped(some, groups)
+    return lit._replace(at=at, share=lit.share[at], target=rows.reshape(*rows.shape[:2], -1, 3 // groups))
 
 
 @dataclass(frozen=True)
@@ -252,11 +273,11 @@ class Decoding:
             importance=data.importance[lighting],
             share=data.share[texel],
         )
-        return _error(parameters, parameters.features[texel], drawn)
+        return _error(parameters, parameters.features[data.at[texel]], drawn)
 
     def check(self, parameters: Decoder, held: Lit) -> Float[Array, ""]:
         """Mean squared error of light, in units of what the baseline leaves of the training light."""
-        return _error(parameters, parameters.features, held)
+        return _error(parameters, parameters.features[held.at], held)
 
 
 def _error(decoder: Decoder, features: Array, data: Lit) -> Float[Array, ""]:
@@ -274,7 +295,8 @@ def _check(problem: Decoding, parameters: Decoder, held: Lit) -> Array:
 @jax.jit
 def _left(data: Lit) -> Float[Array, ""]:
     """See `Lit.rest`; no less than what float32 tells from the light itself."""
-    baseline = jnp.einsum("tok,fgk->fgto", data.start, data.light[..., : len(data.gain)] * data.gain, precision="highest")
+    light = data.light[..., : len(data.gain)] * data.gain
+    baseline = jnp.einsum("tok,fgk->fgto", data.start[data.at], light, precision="highest")
     root = lambda light: jnp.sqrt(jnp.mean(data.importance[:, :, None, None] * data.share * light**2))  # noqa: E731
     floor = jnp.finfo(jnp.float32).eps * root(data.target)
     return jnp.maximum(jnp.maximum(root(baseline - data.target), floor), jnp.finfo(jnp.float32).tiny)

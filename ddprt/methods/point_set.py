@@ -201,6 +201,7 @@ class PointSet(Learned):
         "learning_rate": (1e-4, 3e-4, 1e-3),
         "keep": (0.25, 0.5),
     }
+    streams: ClassVar[bool] = True
     bases: int = Field(16, ge=1)
     ridge: Literal["auto"] | Annotated[float, Field(ge=0)] = "auto"
     latent: int = Field(64, ge=1, description="numbers that stand for all measurements")

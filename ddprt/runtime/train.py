@@ -201,17 +201,17 @@ def _squares(relighter: Relighter | None, encoding: Encoding, examples: Examples
         parts = [slice(start, start + step) for start in range(0, light.shape[0], step)]
     else:
         parts = [slice(None)]
-    # Of methods that stream none asks for lights.
     told = relighter.describe(frame.lightings or ()) if isinstance(relighter, AsksForLights) else None
     described = None if told is None else jnp.asarray(told, jnp.float32)
     squares, peaks = [], []
     for part in parts:
         truth = light.some(part) if isinstance(light, Maps) else light
-        values = frame.values if truth is light else frame.values[part]
-        scale = examples.scale if truth is light else examples.scale[part]
+        values, scale, lamps = (
+            whole if truth is light or whole is None else whole[part] for whole in (frame.values, examples.scale, described)
+        )
         largest = jnp.max(examples.scale, initial=0)
         seen = values, frame.positions, frame.normals
-        found = _squares_of(relighter, encoding, *seen, truth, scale, largest, area, described, not examples.signed)
+        found = _squares_of(relighter, encoding, *seen, truth, scale, largest, area, lamps, not examples.signed)
         squares.append(np.asarray(found[0], np.float64))
         peaks.append(float(found[1]))
     unit = max((peak for peak in peaks if peak > 0), default=1.0)
@@ -315,6 +315,13 @@ class StreamedMaps:
     def some(self, lightings: slice) -> Float[Array, "some texels 3"]:
         """See `Maps`."""
         return self._encode(self.pack.read(self.indices[lightings]), self.scale[lightings])
+
+    def runs(self, starts: Sequence[int], texels: int) -> Float[Array, "lightings some 3"]:
+        """See `Maps`."""
+        whole = self.pack.texels
+        parts = [(start, min(start + texels, whole)) for start in starts]
+        parts = [part for start, stop in parts for part in ((start, stop), (0, start + texels - stop)) if part[0] < part[1]]
+        return self._encode(np.concatenate([self.pack.read(self.indices, *part) for part in parts], 1), self.scale)
 
     def _encode(self, light: np.ndarray, scale: Array) -> Array:
         with jax.enable_x64(False):  # as in memory, whoever asks
