@@ -1,8 +1,7 @@
 """From a dataset to a Model."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float32
+from jaxtyping import Array
 from threadpoolctl import threadpool_limits
 
 from ddprt import seeds
@@ -26,6 +25,8 @@ from ddprt.methods.floors import MeanLightmap, MeanMap
 from ddprt.methods.method import AsksForLights, Examples, FitReport, Frame, Maps, Method, Relighter, block_texels, unseen_share
 from ddprt.methods.statuses import BLIND
 from ddprt.runtime.model import LayerModel, Model
+from ddprt.runtime.programs import make_room
+from ddprt.runtime.streamed import StreamedMaps, encoded
 from ddprt.runtime.trust import Yardstick, calibrated, make_yardstick, outside
 from ddprt.sections import FitConfig
 
@@ -103,6 +104,7 @@ def fit_method(
     Light that takes more than a quarter of the free memory is read a part at a time by methods that can (`Method.streams`);
     `stream` says so or not whatever the sizes. The model is the same but for rounding.
     """
+    make_room()
     method = make_method(name, config.model_dump(exclude={"method", "points"}), settings)
     points = data.description["points"]["count"] if points is None else points
     if points > len(data.samples.position):
@@ -265,7 +267,7 @@ def examples(
     )
     if pack is None:
         light = data.maps("indirect", indices)
-        indirect: Array | Maps = _encoded(encoding, light, scale)
+        indirect: Array | Maps = encoded(encoding, light, scale)
         unseen = unseen_share(np.asarray(scale), light)
     else:
         indirect = StreamedMaps(pack, tuple(indices), encoding, scale)
@@ -279,71 +281,6 @@ def examples(
 def _measured(encoding: Encoding, values: Array) -> tuple[Array, Array]:
     scale = encoding.scale(values)
     return encoding.encode(values, scale), scale
-
-
-@jax.jit
-def _encoded(encoding: Encoding, indirect: Array, scale: Array) -> Array:
-    return encoding.encode(indirect, scale)
-
-
-@dataclass(frozen=True, eq=False)
-class StreamedMaps:
-    """Indirect light of a split that stays in its pack; see `Maps`. A thread reads what comes next meanwhile.
-
-    Attributes:
-      pack: where the light lies.
-      indices: of the lightings.
-      encoding: what it is encoded with.
-      scale: of the lightings.
-    """
-
-    pack: Pack
-    indices: tuple[int, ...]
-    encoding: Encoding
-    scale: Float[Array, "lightings 3"]
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """See `Maps`."""
-        return len(self.indices), self.pack.texels, 3
-
-    def blocks(self) -> Iterator[Float[Array, "lightings block 3"]]:
-        """See `Maps`."""
-        for light in self._read(block_texels(len(self.indices))):
-            yield self._encode(light, self.scale)
-
-    def some(self, lightings: slice) -> Float[Array, "some texels 3"]:
-        """See `Maps`."""
-        return self._encode(self.pack.read(self.indices[lightings]), self.scale[lightings])
-
-    def runs(self, starts: Sequence[int], texels: int) -> Float[Array, "lightings some 3"]:
-        """See `Maps`."""
-        whole = self.pack.texels
-        parts = [(start, min(start + texels, whole)) for start in starts]
-        parts = [part for start, stop in parts for part in ((start, stop), (0, start + texels - stop)) if part[0] < part[1]]
-        return self._encode(np.concatenate([self.pack.read(self.indices, *part) for part in parts], 1), self.scale)
-
-    def _encode(self, light: np.ndarray, scale: Array) -> Array:
-        with jax.enable_x64(False):  # as in memory, whoever asks
-            return _encoded(self.encoding, light, scale)
-
-    def _read(self, texels: int) -> Iterator[Float32[np.ndarray, "lightings block 3"]]:
-        """Light in blocks of so many texels, one ahead of what has been asked for."""
-
-        def read(start: int) -> np.ndarray:
-            stop, after = (min(start + count * texels, self.pack.texels) for count in (1, 2))
-            self.pack.expect(self.indices, stop, after)
-            return self.pack.read(self.indices, start, stop)
-
-        starts = range(0, self.pack.texels, texels)
-        with ThreadPoolExecutor(1) as reader:
-            coming = [reader.submit(read, starts[0])]
-            for start in (*starts[1:], None):
-                light = coming.pop().result()
-                if start is not None:
-                    coming.append(reader.submit(read, start))
-                yield light
-                del light
 
 
 def _streamed(data: Dataset, method: Method, name: str, asked: bool | None) -> Pack | None:
