@@ -110,6 +110,15 @@ def test_every_kind_of_lamp_is_told(kind: str, network: LightNetwork) -> None:
     assert np.isfinite(network.describe([(light,)])).all()
 
 
+@pytest.mark.parametrize(("radii", "share"), [(0.0, 1.0), (0.5, 1.0), (1.0, 1.0), (2.0, 1 / 4), (10.0, 1 / 100)])
+def test_a_lamp_counts_by_what_it_brings_to_the_centre(radii: float, share: float) -> None:
+    """Of 4 W/sr, over a radius of 2 m; no more than from there, however near."""
+    x, y, z = map(float, AROUND.centre)
+    ((strength, told),) = AROUND.lobes(PointLight(position=(x, y + 2 * radii, z), intensity=(4.0, 4.0, 4.0)))
+    np.testing.assert_allclose(strength, share, rtol=1e-12)
+    assert told[1] == pytest.approx(radii)
+
+
 def test_a_sky_is_directional_lights_of_its_harmonics(network: LightNetwork) -> None:
     """Sums over the nodes give back the harmonics that the sky has: the quadrature is exact for products of two."""
     given = np.random.default_rng(0).standard_normal((harmonics.count(6), 3))

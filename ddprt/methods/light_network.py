@@ -63,7 +63,11 @@ class Surroundings:
         return cls((low + high) / 2, float(np.linalg.norm(high - low)) / 2 or 1.0)
 
     def lobes(self, light: Any) -> list[Lobe]:
-        """A light as strengths, W/m² at one radius, and what is told of each.
+        """A light as strengths, and what is told of each.
+
+        A strength is what parallel light brings, or a lamp at the centre of the points if it shone there; of lamps nearer than
+        a radius, where that has no bounds, what they bring at one. So less is left to learn of how light falls off.
+
 
         Raises:
           UserError: a kind that is not known here.
@@ -78,7 +82,7 @@ class Surroundings:
         strength, direction, cone, facing = _LAMPS[light.kind](light)
         place = (light.anchor() - self.centre) / self.radius
         told = np.concatenate([place, direction, cone, [facing, 1.0, light.reach() / self.radius]])
-        return [(np.asarray(strength, np.float64) / self.radius**2, told)]
+        return [(np.asarray(strength, np.float64) / (self.radius**2 * max(1.0, float(place @ place))), told)]
 
     def _distant(self, irradiance: Any, direction: np.ndarray) -> Lobe:
         return np.asarray(irradiance, np.float64), np.concatenate([_NOWHERE, direction, _ROUND, np.zeros(3)])

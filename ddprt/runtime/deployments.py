@@ -137,8 +137,8 @@ def _cosines(found: LightNetwork, model: Model) -> Deployment:
         _UNLIT,
         "each light is a strength per channel and eleven numbers t: (position - centre) / radius, direction (0 if all around), "
         "cosines of inner and outer half-angle (-1 if none), 1 if it is a surface, 1 if it has a place, reach / radius",
-        "strength, over radius² but for parallel light: intensity of point and spot, radiance * area of a surface, "
-        "pi r² * radiance of a sphere, irradiance of parallel light, which has no place; a sky is many parallel lights",
+        "strength: intensity of point and spot, radiance * area of a surface, pi r² * radiance of a sphere, each over "
+        "max(radius, distance from the centre)²; irradiance of parallel light, which has no place; a sky is many",
         "position of a surface: its centre; its direction: mean of normals by area; reach: from there to its farthest point",
         "phi[c] = sum over lights of strength[c] cos(t frequencies + phases); f = phi[c] for channel c (mono), or phi of red, "
         "green and blue one after the other (multi)",
