@@ -30,7 +30,6 @@ class Autoencoder(Learned):
     why: ClassVar[str] = "learned: does gradient descent from a random start find the SVD's subspace?"
     search: ClassVar[Mapping[str, tuple[Any, ...]]] = {
         "bases": (6, 8, 12, 14, 16, 24, 32),
-        "ridge": ("auto", 1e-5, 1e-3),
         "steps": (300, 2000),
     }
     bases: int = Field(16, ge=1)

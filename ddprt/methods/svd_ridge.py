@@ -104,7 +104,6 @@ class SvdRidge(Method):
     why: ClassVar[str] = "the paper's baseline: closed form, linear, the reference point"
     search: ClassVar[Mapping[str, tuple[Any, ...]]] = {
         "bases": (6, 8, 12, 14, 16, 24, 32),
-        "ridge": ("auto", 1e-5, 1e-3),
         "smooth": (0.0, 1.0, 3.0),
         "centre": ("none", "mean"),
         "fit.space": ("linear", "linear", "gamma"),
