@@ -176,7 +176,7 @@ class NeuralMap(Learned):
         gain = spread[:kept]
         seen, held = (part._replace(light=part.light / spread, gain=gain) for part in (seen, held))
         draw = jax.random.fold_in(key, 0)
-        rest = _left(_looked_at(seen, train, draw, 0, CHECKED))
+        rest = _left(_looked_at(seen, train, draw, 0))
         seen, held = seen._replace(rest=rest), held._replace(rest=rest)
         of_round = partial(_looked_at, seen, train, draw)
         held = _looked_at(held, validation, draw, 0, CHECKED)
