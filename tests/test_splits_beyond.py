@@ -105,7 +105,18 @@ def test_more_lights_are_asked_about_and_noted_once(tmp_path: Path, monkeypatch:
         raise AssertionError("was measured again")
 
     monkeypatch.setattr(Generalisation, "_measured", never)
-    assert Generalisation(config, data, scene, tmp_path, QUIET).run(["crowd"]) == records
+    again = Generalisation(config, data, scene, tmp_path, QUIET)
+    assert again.run(["crowd"]) == records
+
+    class Another(Gain):
+        """The same by another default."""
+
+        more: float = 1.5
+
+    monkeypatch.setitem(METHODS, "gain", Another)
+    again._side("crowd", sides[0], BASELINE, 0)
+    with pytest.raises(AssertionError, match="was measured again"):
+        again._side("crowd", sides[0], "gain", 0)
 
 
 @pytest.mark.slow

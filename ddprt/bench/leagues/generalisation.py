@@ -9,7 +9,7 @@ from typing import Any
 
 from ddprt.bench.leagues.contest import SCHEMA, Record, known, parts
 from ddprt.bench.leagues.deals import deal, method_seed
-from ddprt.bench.leagues.search import BASELINE, rivals
+from ddprt.bench.leagues.search import BASELINE, Trial, rivals
 from ddprt.bench.leagues.splits import SPLITS, Side
 from ddprt.bench.leagues.standings import Difference, difference, pooled
 from ddprt.bench.leagues.words import against, with_spread
@@ -93,11 +93,12 @@ class Generalisation:
             raise UserError(f"{side.label}: none of that light gets into the scene, or there is nothing that it bounces off")
 
     def _side(self, name: str, side: Side, method: str, seed: int) -> Record:
-        digest = digest_of([
-            self._source, name, side.label, side.learn, side.judge, side.train, side.points, side.asked, method, seed,
-            self.config.fit.model_dump(mode="json"), self.config.methods.settings.get(method, {}), self.config.seed,
-            self.config.points.quantity, self.config.export.precision,
-        ])  # fmt: skip
+        try:
+            fitted = Trial(method, seed, {}).digest(self.config, self._source)
+        except UserError:  # settings that it does not take: its record will say so
+            fitted = digest_of([self._source, method, seed, self.config.methods.settings.get(method, {})])
+        asked = [name, side.label, side.learn, side.judge, side.train, side.points, side.asked]
+        digest = digest_of([fitted, *asked])
         key = f"side {digest}"
         if key not in self._known:
             about = {"schema": SCHEMA, "what": "side", "digest": digest, "split": name, "side": side.label}
