@@ -105,10 +105,10 @@ def bench(call: Call) -> None:
 
 def leagues(call: Call) -> None:
     """Methods under the same budgets, and on lightings unlike those of training."""
-    from ddprt.bench.leagues.generalisation import Generalisation, markdown, told
+    from ddprt.bench.leagues.generalisation import Generalisation
     from ddprt.bench.leagues.leagues import leagues
+    from ddprt.bench.leagues.split_pages import told, write_splits
     from ddprt.bench.leagues.splits import split_names
-    from ddprt.files import write_text
 
     names = split_names(call.options["splits"]) if call.asks("splits") else []
     job = call.run()
@@ -116,8 +116,7 @@ def leagues(call: Call) -> None:
     data, folder, found = job.bake(), job.folder / "bench", []
     if names:
         found = told(Generalisation(job.config, data, scene, folder, job.progress).run(names), names)
-        write_text(folder / "splits.md", markdown(found, job.config.scene.name))
-        print(f"splits:   {folder / 'splits.md'}")
+        print(f"splits:   {write_splits(folder, found, job.config.scene.name)}")
     if call.asks("leagues"):
         results, table, page = leagues(job.config, data, scene, folder, job.progress, splits=found)[1]
         print(f"results:  {results}\ntable:    {table}\npage:     {page}")

@@ -27,15 +27,16 @@ from learned_pace import pace
 from scipy.linalg import subspace_angles
 
 import ddprt
-from ddprt.bench.leagues.generalisation import Generalisation, markdown, told
+from ddprt.bench.leagues.generalisation import Generalisation
 from ddprt.bench.leagues.leagues import leagues
 from ddprt.bench.leagues.search import BASELINE
+from ddprt.bench.leagues.split_pages import Found, told, write_splits
 from ddprt.bench.leagues.splits import SPLITS
 from ddprt.bench.leagues.standings import Place
 from ddprt.bench.leagues.words import against
 from ddprt.config import Config, checked
 from ddprt.dataset.store import Dataset
-from ddprt.files import cache_folder, write_text
+from ddprt.files import cache_folder
 from ddprt.fitting.basis import entry_weights
 from ddprt.machine import instruction_set
 from ddprt.pipeline import Run
@@ -146,20 +147,20 @@ def keep_compiled() -> None:
 def scene(name: str, folder: Path, quick: bool) -> tuple[dict[str, list[Place]], Dataset, list[str]]:
     """Leagues of a scene and, unless it is to be quick, its splits."""
     job = Run(config(name, quick), folder, quiet=quick)
-    data, found = job.bake(), list[dict[str, Any]]()
+    data, found = job.bake(), list[Found]()
     if not quick:
         found = generalised(job, data, [split for split in SPLITS if split != "size"])
     table, files = leagues(job.config, data, job.scene, folder / "bench", job.progress, splits=found)
     if not quick:
         print(files[1].read_text(), flush=True)
-    return table, data, [f"{split['name']}: {line}" for split in found for line in split["words"]]
+    return table, data, [f"{split.name}: {line}" for split in found for line in split.words]
 
 
-def generalised(job: Run, data: Dataset, names: Sequence[str]) -> list[dict[str, Any]]:
+def generalised(job: Run, data: Dataset, names: Sequence[str]) -> list[Found]:
     """What came out of some splits; also in splits.md."""
     bench = job.folder / "bench"
     found = told(Generalisation(job.config, data, job.scene, bench, job.progress).run(names), names)
-    write_text(bench / "splits.md", markdown(found, job.config.scene.name))
+    write_splits(bench, found, job.config.scene.name)
     return found
 
 

@@ -130,6 +130,8 @@ def test_budgets_are_those_given_or_the_baselines() -> None:
         (-0.1, 0.1, 0.0, "within the spread"),
         (-0.2, 0.1, 0.1, "within the spread"),
         (-0.2, None, 0.0, "one seed"),
+        (-0.0004, 0.0001, 0.0, "within the spread"),
+        (-0.0006, 0.0001, 0.0, "better"),
     ],
 )
 def test_verdicts(mean: float, spread: float | None, doubt: float, verdict: str) -> None:

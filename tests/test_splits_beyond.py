@@ -9,8 +9,9 @@ from small_job import base
 from small_rival import Gain
 
 import ddprt
-from ddprt.bench.leagues.generalisation import Generalisation, asked_with, markdown, tally_with, told
+from ddprt.bench.leagues.generalisation import Generalisation, asked_with, tally_with
 from ddprt.bench.leagues.search import BASELINE
+from ddprt.bench.leagues.split_pages import Found, markdown, told, write_splits
 from ddprt.bench.leagues.splits import SPLITS, split_names
 from ddprt.bench.measure.settings import changed
 from ddprt.errors import UserError
@@ -44,7 +45,7 @@ def test_what_is_asked_about_is_outside_of_what_is_trained_on() -> None:
     assert around[1].judge == {"lightings.elevation_deg": [10, 30]}
     noisy = SPLITS["noise"].sides(base(transport__samples="auto", transport__target_noise=0.01))
     assert noisy[2].learn == {"transport.target_noise": 0.04}  # a sixteenth of the rays has four times the noise
-    assert [side.train for side in SPLITS["size"].sides(base(lightings__train=40))] == [0, 32, 16, 8]
+    assert [side.train for side in SPLITS["size"].sides(base(lightings__train=40))] == [40, 32, 16, 8]
 
 
 def test_a_configuration_that_cannot_be_asked_says_why(tmp_path: Path) -> None:
@@ -87,9 +88,9 @@ def test_more_lights_are_asked_about_and_noted_once(tmp_path: Path, monkeypatch:
         squares = Truth(judged.maps("indirect", judged.split("test")), judged.area).squares
         np.testing.assert_array_equal(record["squares"], squares)
     found = told(records, ["crowd"])[0]
-    assert [name for name, _ in found["rows"]] == [BASELINE, "gain"]
-    assert found["sides"] == ["1 light, as trained", "4 lights"]
-    assert "4 lights: " in found["words"][0]
+    assert [name for name, _ in found.rows] == [BASELINE, "gain"]
+    assert found.sides == ["1 light, as trained", "4 lights"]
+    assert "4 lights: " in found.words[0]
     model = first._model(sides[0], BASELINE, 0)
     with pytest.raises(UserError, match="the 12 points that it was fitted with"):
         asked_with(model, 6)
@@ -128,9 +129,9 @@ def test_light_that_does_not_get_in_is_told_and_a_method_that_cannot_too(tmp_pat
     with pytest.warns(UserWarning, match="doubtful"):
         records = Generalisation(config, data, scene, tmp_path, QUIET).run(["kind", "size"])
     kind, size = told(records, ["kind", "size"]) if len(records) > 1 else (told(records, ["kind"])[0], None)
-    assert "none of that light gets into the scene" in kind["cannot"]
+    assert "none of that light gets into the scene" in kind.cannot
     assert "Cannot be done here" in markdown([kind], "box")
-    assert size is None or size["cannot"]  # eight lightings have no smaller size
+    assert size is None or size.cannot  # eight lightings have no smaller size
     own = Generalisation(config, data, scene, tmp_path, QUIET).run(["crowd"])
     by_name = {record["method"]: record["failed"] for record in own}
     assert by_name[BASELINE] is None
@@ -140,8 +141,30 @@ def test_light_that_does_not_get_in_is_told_and_a_method_that_cannot_too(tmp_pat
 
 def test_a_refusal_is_told_once_under_its_table() -> None:
     rows = [("svd-ridge", ["3 %", "4 %"]), ("sh-prt", ["sh-prt: takes suns", "sh-prt: takes suns"])]
-    split = {"name": "kind", "question": "?", "cannot": "", "sides": ["a", "b"], "rows": rows, "words": ["b: nobody."]}
-    text = markdown([split], "box")
+    text = markdown([Found("kind", "?", sides=["a", "b"], rows=rows, words=["b: nobody."])], "box")
     assert "| sh-prt | – | – |\n" in text
     assert text.count("sh-prt: takes suns") == 1
     assert text.endswith("- b: nobody.\n- sh-prt: takes suns\n")
+
+
+def test_a_split_that_grows_is_a_curve_beside_its_table(tmp_path: Path) -> None:
+    """Marks stand where numbers of lightings do, none where a method failed."""
+    sides = SPLITS["size"].sides(base(lightings__train=40))
+    assert [side.at for side in sides] == [40, 32, 16, 8]
+    made = [
+        {"what": "side", "split": "size", "side": side.label, "at": side.at, "method": name, "seed": seed, "mean": [1.0, 1.0]}
+        | {"error": [1.0 / side.at, (1.0 + 0.1 * seed) / side.at]}
+        | {"failed": "gain: too few" if name == "gain" and side.at == 8 else None}
+        for name in (BASELINE, "gain", "mlp")
+        for seed in (0, 1)
+        for side in sides
+    ]
+    found = told(made, ["size"])
+    text = write_splits(tmp_path, found, "box").read_text()
+    assert "![size](splits-size.svg)" in text
+    assert "| gain |" in text
+    picture = (tmp_path / "splits-size.svg").read_text()
+    assert picture == found[0].curve
+    for word in (BASELINE, "gain", "mlp", "training lightings", ">8<", ">16<", ">32<", ">40<"):
+        assert word in picture
+    assert told([{"what": "split", "split": "size", "failed": "no"}], ["size"])[0].curve == ""

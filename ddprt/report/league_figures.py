@@ -1,4 +1,4 @@
-"""Figures of methods compared: error against training seconds, losses over time, a rival against the baseline by lighting.
+"""Figures of methods compared: error against training seconds or data, losses over time, a rival against the baseline.
 
 SVG text that stands by itself, the same bytes every time.
 """
@@ -98,6 +98,34 @@ def lightings_figure(
         _legend(axes)
 
     return _svg(f"lightings-{name}", draw)
+
+
+def growth_figure(curves: Mapping[str, Sequence[tuple[int, Float64[np.ndarray, " seeds"]]]], axis: str) -> str:
+    """Error of each method over a number that grows, and one standard deviation over seeds to both sides.
+
+    Args:
+      curves: (number, relative RMSE of each seed) by method, the baseline first.
+      axis: what the number is of.
+    """
+
+    def draw(axes: Any) -> None:
+        from matplotlib.ticker import NullLocator
+
+        for name, (colour, mark) in looks(list(curves)).items():
+            found = sorted(curves[name], key=lambda pair: pair[0])
+            if not found:
+                continue
+            at, mean = [number for number, _ in found], np.array([100 * errors.mean() for _, errors in found])
+            spread = np.array([100 * errors.std(ddof=1) if len(errors) > 1 else 0.0 for _, errors in found])
+            axes.errorbar(at, mean, spread, fmt=f"{mark}-", color=colour, label=name, linewidth=1, elinewidth=0.7)
+        axes.set(xlabel=axis, ylabel="relative RMSE (%)", xscale="log", yscale="log")
+        axes.set_xticks(sorted({number for curve in curves.values() for number, _ in curve}))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_locator(NullLocator())
+        _plain(axes.yaxis)
+        _legend(axes)
+
+    return _svg("growth", draw)
 
 
 def _plain(*along: Any) -> None:

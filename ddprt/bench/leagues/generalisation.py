@@ -2,17 +2,15 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from ddprt.bench.leagues.contest import SCHEMA, Record, known, parts
 from ddprt.bench.leagues.deals import deal, method_seed
-from ddprt.bench.leagues.search import BASELINE, Trial, rivals
+from ddprt.bench.leagues.search import Trial, rivals
 from ddprt.bench.leagues.splits import SPLITS, Side
-from ddprt.bench.leagues.standings import Difference, difference, pooled
-from ddprt.bench.leagues.words import against, with_spread
 from ddprt.bench.measure.settings import changed, digest_of
 from ddprt.bench.measure.trial import environment, why
 from ddprt.bench.measure.yardstick import Yardstick
@@ -97,11 +95,10 @@ class Generalisation:
             fitted = Trial(method, seed, {}).digest(self.config, self._source)
         except UserError:  # settings that it does not take: its record will say so
             fitted = digest_of([self._source, method, seed, self.config.methods.settings.get(method, {})])
-        asked = [name, side.label, side.learn, side.judge, side.train, side.points, side.asked]
-        digest = digest_of([fitted, *asked])
+        digest = digest_of([fitted, name, asdict(side)])
         key = f"side {digest}"
         if key not in self._known:
-            about = {"schema": SCHEMA, "what": "side", "digest": digest, "split": name, "side": side.label}
+            about = {"schema": SCHEMA, "what": "side", "digest": digest, "split": name, "side": side.label, "at": side.at}
             record = {
                 **about,
                 "method": method,
@@ -200,72 +197,3 @@ def tally_with(model: Model, truth: Yardstick, points: int) -> Tally:
         predicted = fewer.predict(values[:points], lightings=truth.data.lightings[index], constant=False)[None]
         found.append(Truth(truth.data.maps("indirect", [index]), truth.data.area).tally(predicted))
     return Tally.joined(found)
-
-
-def told(records: Sequence[Record], names: Sequence[str]) -> list[dict[str, Any]]:
-    """Of each split its question, sides, a row for each method, and what came out in words; or why it cannot be done."""
-    found = []
-    for name in names:
-        own = [record for record in records if record["split"] == name]
-        question = SPLITS[name].question
-        if hindered := [record["failed"] for record in own if record["what"] == "split"]:
-            found.append({"name": name, "question": question, "cannot": hindered[0], "sides": [], "rows": [], "words": []})
-            continue
-        sides, methods = (list(dict.fromkeys(record[key] for record in own)) for key in ("side", "method"))
-        cells = {
-            (method, side): [one for one in own if one["method"] == method and one["side"] == side]
-            for method in methods
-            for side in sides
-        }
-        rows = [(method, [_cell(cells[method, side], cells[BASELINE, side]) for side in sides]) for method in methods]
-        words = [_sentence(side, {method: cells[method, side] for method in methods}) for side in sides[1:]]
-        found.append({"name": name, "question": question, "cannot": "", "sides": sides, "rows": rows, "words": words})
-    return found
-
-
-def compared(own: Sequence[Record], base: Sequence[Record]) -> Difference | None:
-    """A method beside the baseline; None where either could not do it."""
-    if any(record["failed"] for record in (*own, *base)) or own[0]["method"] == BASELINE:
-        return None
-    return difference(own, base)
-
-
-def _cell(own: Sequence[Record], base: Sequence[Record]) -> str:
-    if failed := [record["failed"] for record in own if record["failed"]]:
-        return failed[0]
-    errors = pooled(own)
-    spread = float(errors.std(ddof=1)) if len(errors) > 1 else None
-    apart = compared(own, base)
-    beside = "" if apart is None else f" ({against(apart)}, {apart.verdict})"
-    return with_spread(float(errors.mean()), spread) + beside
-
-
-def _sentence(side: str, by_method: Mapping[str, Sequence[Record]]) -> str:
-    base = by_method[BASELINE]
-    if any(record["failed"] for record in base):
-        rivals_that_can = [name for name, own in by_method.items() if not any(record["failed"] for record in own)]
-        return f"{side}: {BASELINE} cannot do it; {', '.join(rivals_that_can) or 'nobody'} can."
-    apart = {name: found for name, own in by_method.items() if (found := compared(own, base)) is not None}
-    better = sorted((name for name in apart if apart[name].verdict == "better"), key=lambda name: apart[name].mean)
-    if better:
-        return f"{side}: better than {BASELINE} by more than the spread: " + ", ".join(
-            f"{name} ({against(apart[name])})" for name in better
-        ) + "."  # fmt: skip
-    return f"{side}: nobody is better than {BASELINE} by more than the spread."
-
-
-def markdown(splits: Sequence[Mapping[str, Any]], title: str) -> str:
-    """splits.md."""
-    lines = [f"# Splits: {title}", ""]
-    for split in splits:
-        lines += [f"## {split['name']}", "", str(split["question"]), ""]
-        if split["cannot"]:
-            lines += [f"Cannot be done here: {split['cannot']}.", ""]
-            continue
-        lines += ["| method | " + " | ".join(split["sides"]) + " |", "|" + " --- |" * (1 + len(split["sides"]))]
-        refused = {cell: "–" for name, cells in split["rows"] for cell in cells if cell.startswith(f"{name}: ")}
-        lines += [
-            f"| {name} | " + " | ".join(refused.get(cell, cell) for cell in cells) + " |" for name, cells in split["rows"]
-        ]
-        lines += ["", *(f"- {line}" for line in (*split["words"], *refused)), ""]
-    return "\n".join(lines)

@@ -7,6 +7,7 @@ from typing import Any
 from ddprt.bench.leagues.contest import RESULTS, Contest
 from ddprt.bench.leagues.page import leader, pictures_of, write_pages
 from ddprt.bench.leagues.search import BASELINE, Trial
+from ddprt.bench.leagues.split_pages import Found
 from ddprt.bench.leagues.standings import Place, budgets_of, standings
 from ddprt.config import Config
 from ddprt.dataset.store import Dataset
@@ -22,7 +23,7 @@ def leagues(
     folder: Path,
     progress: Progress,
     *,
-    splits: Sequence[Mapping[str, Any]] = (),
+    splits: Sequence[Found] = (),
 ) -> tuple[dict[str, list[Place]], list[Path]]:
     """Compares methods under three budgets.
 

@@ -11,6 +11,7 @@ import numpy as np
 from ddprt import __version__
 from ddprt.bench.leagues import words
 from ddprt.bench.leagues.search import BASELINE
+from ddprt.bench.leagues.split_pages import Found
 from ddprt.bench.leagues.standings import LEAGUES, Budgets, Place, Record, groups_of
 from ddprt.dataset.store import Dataset
 from ddprt.files import write_text
@@ -48,7 +49,7 @@ def write_pages(
     trials: int,
     seeds: int,
     shown: Sequence[Shown] = (),
-    splits: Sequence[Mapping[str, Any]] = (),
+    splits: Sequence[Found] = (),
 ) -> list[Path]:
     """Writes both files.
 
@@ -60,7 +61,7 @@ def write_pages(
       title: names the scene.
       trials, seeds: as configured.
       shown: pictures, of `pictures_of`.
-      splits: of `ddprt.bench.leagues.generalisation.told`.
+      splits: of `ddprt.bench.leagues.split_pages.told`.
     Raises:
       UserError: a file cannot be written.
     """
@@ -85,7 +86,7 @@ def write_pages(
         time=_over_time(records, table, names, budgets),
         scatters=_scatters(table, lightings),
         pictures=shown,
-        splits=splits,
+        splits=[(split, _encoded(split.curve.encode())) for split in splits],
         machines=_machines(records),
     )
     write_text(folder / PAGE, page)

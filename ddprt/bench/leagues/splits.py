@@ -27,6 +27,7 @@ class Side:
       train: keep only so many training lightings; 0 keeps all.
       points: fit with so many; 0 as configured.
       asked: ask with so many, of a model that was fitted with all; 0 asks as it was fitted.
+      at: where it stands on the axis of a split that is a curve.
     """
 
     label: str
@@ -35,6 +36,7 @@ class Side:
     train: int = 0
     points: int = 0
     asked: int = 0
+    at: int = 0
 
 
 @dataclass(frozen=True)
@@ -44,10 +46,12 @@ class Split:
     Attributes:
       question: in words.
       sides: of a configuration; raises UserError for one that it cannot be asked about.
+      axis: what its sides are a curve over; nothing where they are none.
     """
 
     question: str
     sides: Callable[[Config], list[Side]]
+    axis: str = ""
 
 
 def _kind(config: Config) -> list[Side]:
@@ -124,7 +128,7 @@ def _size(config: Config) -> list[Side]:
     fewer = [count for count in _SIZES if count < whole]
     if not fewer:
         raise UserError(f"lightings.train: got {whole}, expected more than {_SIZES[0]} for a curve")
-    return [Side(f"{whole} lightings"), *(Side(f"{count}", train=count) for count in reversed(fewer))]
+    return [Side(f"{count} lightings", train=count, at=count) for count in (whole, *reversed(fewer))]
 
 
 def _drawn(config: Config) -> None:
@@ -143,7 +147,7 @@ SPLITS: Catalogue[Split] = Catalogue(
         "noise": Split(
             "Training maps of a fraction of the rays; held-out maps as they are. Who profits from cheap data?", _noise
         ),
-        "size": Split("Fewer training lightings, as a curve.", _size),
+        "size": Split("Fewer training lightings, as a curve.", _size, "training lightings"),
     },
 )
 

@@ -15,6 +15,7 @@ Record = Mapping[str, Any]
 SLACK = 1.5  # of the seconds: times of one and the same fit differ by that much on a machine that others use
 _DRAWS = 2000  # of the held-out lightings, with repetition
 _SURE = 2.0  # standard errors over held-out lightings
+_SMALL = 5e-4  # a difference that tables round to 0.0 % is none, however sure
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ class Difference:
         """ "better", "worse" or "within the spread"; of one seed nothing is claimed."""
         if self.spread is None:
             return "one seed"
-        if abs(self.mean) <= max(self.spread, _SURE * self.doubt):
+        if abs(self.mean) <= max(self.spread, _SURE * self.doubt, _SMALL):
             return "within the spread"
         return "better" if self.mean < 0 else "worse"
 
