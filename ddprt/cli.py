@@ -79,13 +79,15 @@ def _by_interrupt(error: BaseException) -> bool:
 
 @contextmanager
 def _doubts_in_one_line() -> Iterator[None]:
-    """Doubts about a result reach stderr even with --quiet, each as one line and without a line of code below it."""
+    """Doubts about a result reach stderr even with --quiet, each once, as one line and without a line of code below it."""
     with warnings.catch_warnings():
-        as_before = warnings.showwarning
+        as_before, said = warnings.showwarning, set[str]()
 
         def show(message: Warning | str, category: type[Warning], *where: Any) -> None:
             if issubclass(category, Doubt):
-                print(f"warning: {message}", file=sys.stderr, flush=True)
+                if str(message) not in said:
+                    print(f"warning: {message}", file=sys.stderr, flush=True)
+                said.add(str(message))
             else:
                 as_before(message, category, *where)
 

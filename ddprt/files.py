@@ -75,7 +75,7 @@ def _locked(folder: Path) -> int | None:
         if _is_at(path, lock):
             return lock
         os.close(lock)  # whoever was here before removed it between our opening and our locking
-    raise UserError(f"{folder}: another bake is working in this folder; wait for it, or give another --out")
+    raise UserError(f"{folder}: another command is working in this folder; wait for it, or give another --out")
 
 
 def _is_at(path: Path, file: int) -> bool:

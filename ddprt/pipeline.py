@@ -19,7 +19,7 @@ from ddprt.dataset.light_files import check_skies
 from ddprt.dataset.sameness import other_settings
 from ddprt.dataset.store import Dataset, open_dataset
 from ddprt.errors import UserError
-from ddprt.files import make_folder, write_text
+from ddprt.files import alone_in, make_folder, write_text
 from ddprt.machine import machine, peak_memory_gib
 from ddprt.progress import Progress
 from ddprt.scene.files import IMPORTED
@@ -147,9 +147,20 @@ class Run:
     def fit(self, data: Dataset) -> tuple[dict[str, Any], dict[str, float]]:
         """Fits every method of the comparison and saves the main one; returns models and seconds by name.
 
-        What trains leaves its JSON lines in the folder `training`, and until the main model is saved, checkpoints: who was
+        What trains leaves its JSON lines in the folder `training`, and until all are fitted, checkpoints: who was
         interrupted goes on from there.
+
+        Raises:
+          UserError: a method or setting that there is not, a method that cannot learn from this, or another process in the
+            folder.
         """
+        from ddprt.methods.names import check_names
+
+        check_names(self.config)
+        with alone_in(self.folder):
+            return self._fitted(data)
+
+    def _fitted(self, data: Dataset) -> tuple[dict[str, Any], dict[str, float]]:
         from ddprt.methods.statuses import NOTES, STATUSES, worst_first
         from ddprt.runtime.train import fit_config
         from ddprt.training.journal import keeping
@@ -164,8 +175,10 @@ class Run:
                     models[name] = fit_config(data, self.config, name)
                 seconds[name] = time.perf_counter() - start + kept.earlier
                 stage.facts["status"] = models[name].relighter.report.status
-        main = models[names[0]]
-        report = main.relighter.report
+            if name == names[0]:  # whatever becomes of those that it is compared with
+                models[name].save(self.folder / "model.ddprt")
+                write_text(self.folder / "config.toml", self.config.to_toml(self.folder))
+        report = models[names[0]].relighter.report
         if report.bases and report.bases < self.config.fit.bases:
             self.progress.warn(
                 f"fit.bases: asked for {self.config.fit.bases}, the data has rank {report.numerical_rank}: "
@@ -179,11 +192,9 @@ class Run:
         for name, model in models.items():
             if model.relighter.report.trouble:
                 self.progress.warn(f"{name}: {model.relighter.report.trouble}")
-        main.save(self.folder / "model.ddprt")
         for name in names:  # another fit is to take its own time
             for path in (self.folder / "training" / name).glob("*.safetensors"):
                 path.unlink()
-        write_text(self.folder / "config.toml", self.config.to_toml(self.folder))
         return models, seconds
 
     def evaluate(self, data: Dataset, models: dict[str, Any], seconds: dict[str, float]) -> Any:

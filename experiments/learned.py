@@ -52,6 +52,7 @@ SCENES: dict[str, dict[str, Any]] = {
 }
 MANY = {"train": 1024, "validation": 64}  # lightings of the curve over data size
 OPEN = 10**15  # a budget that everybody keeps
+FEW = 8  # bases of what is measured once, and of --quick, so that what was compiled for one serves the other
 
 
 def config(scene: str, quick: bool, **counts: int) -> Config:
@@ -63,7 +64,7 @@ def config(scene: str, quick: bool, **counts: int) -> Config:
         "lightings": {**lightings, **SCENES.get(scene, {}), **counts},
         "points": {"count": 32 if quick else 64, "supersample": 4 if quick else 8},
         "transport": {"samples": 32, "test_samples": 256} if quick else {"target_noise": 0.01},
-        "fit": {"bases": 8 if quick else 16},
+        "fit": {"bases": FEW if quick else 16},
         "bench": {"repeats": 1 if quick else 5},
         "leagues": {"trials": 1, "bytes": OPEN, "flops": OPEN, "seconds": 1e9} if quick else {"seconds": 20.0},
     }
@@ -122,7 +123,7 @@ class Stopper:
 
 def resumes(data: Dataset, folder: Path) -> bool:
     """Whether a training that was interrupted after its first look comes to the same bits as one that was not."""
-    fit = lambda: ddprt.fit(data, "mlp", settings={"steps": 60, "check_every": 20})  # noqa: E731
+    fit = lambda: ddprt.fit(data, "mlp", bases=FEW, settings={"steps": 60, "check_every": 20})  # noqa: E731
     try:
         with keeping(folder, Stopper(), every=0):  # type: ignore[arg-type]
             fit()
@@ -191,7 +192,7 @@ def compared(names: Sequence[str], out: Path, quick: bool) -> dict[str, Any]:
             "baseline": told[BASELINE],
             "wins": {name: own["wins"] for name, own in found.items()} if not quick else {},
             "splits": {name: own["splits"] for name, own in found.items()} if not quick else {},
-            "subspace_angle_deg": round(subspace_angle(first, 8), 4),
+            "subspace_angle_deg": round(subspace_angle(first, FEW), 4),
             "resume_bit_identical": resumes(first, Path(scratch)),
             **pace(300 if quick else 1000, 3 if quick else 7),
             "seconds": round(time.perf_counter() - begun, 1),

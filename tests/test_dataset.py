@@ -182,7 +182,7 @@ def test_a_lock_dies_with_its_process_and_keeps_no_reader_out(
             with pytest.raises(SystemExit) as refused:
                 main(["bake", str(job), "--out", str(folder.parent)])
             assert refused.value.code == 2
-            words = f"{folder}: another bake is working in this folder; wait for it, or give another --out\n"
+            words = f"{folder}: another command is working in this folder; wait for it, or give another --out\n"
             assert capsys.readouterr().err.endswith(words)
             assert len(open_dataset(folder).maps("indirect", range(8))) == 8
             with pytest.raises(SystemExit) as fine:
@@ -199,7 +199,7 @@ def test_a_bake_is_alone_to_its_end(baked: Path, cornell: Scene, tmp_path: Path,
     refused = []
 
     def intruding(self: Scratch) -> None:
-        with pytest.raises(UserError, match="another bake is working in this folder"):
+        with pytest.raises(UserError, match="another command is working in this folder"):
             bake(cornell, config=small(), out=tmp_path / "dataset")
         refused.append(self.path.name)
         remove(self)
@@ -225,7 +225,7 @@ def test_a_lock_whose_file_was_just_removed_is_none(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(fcntl, "flock", late)
     with alone_in(tmp_path / "dataset"):
         assert len(tries) == 2
-        with pytest.raises(UserError, match="another bake"), alone_in(tmp_path / "dataset"):
+        with pytest.raises(UserError, match="another command"), alone_in(tmp_path / "dataset"):
             pass
     assert list(tmp_path.iterdir()) == [], "no folder where nothing was written"
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from small_job import SMALL, call
 
-from ddprt.files import read_tensors
+from ddprt.files import alone_in, read_tensors
 from ddprt.methods.statuses import STATUSES
 from ddprt.training import loop
 
@@ -71,7 +71,7 @@ def lines(run: Path) -> list[dict[str, Any]]:
 
 
 def test_an_interrupted_fit_goes_on_to_the_same_bits(
-    whole: Path, interrupted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: Path, interrupted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The same command; every byte of the model is that of a fit which nobody stopped, and nothing is trained twice."""
     run = tmp_path / "run"
@@ -79,7 +79,8 @@ def test_an_interrupted_fit_goes_on_to_the_same_bits(
     done = len(read_tensors(run / "training" / "mlp" / "mlp.safetensors")["looks"])
     before, counted, make = lines(run)[done - 1]["seconds"], [], loop._round
     monkeypatch.setattr(loop, "_round", lambda *arguments: counted.append(0) or make(*arguments))
-    assert call("fit", interrupted.parent / "job.toml", "--out", run, "--quiet", *WORDS) == 0
+    assert call("fit", interrupted.parent / "job.toml", "--out", run, *WORDS) == 0
+    assert f"went_on_from_step {20 * done}," in capsys.readouterr().err
     assert len(counted) == ROUNDS - done
     for file in ("tensors.safetensors", "model.json"):
         assert (run / "model.ddprt" / file).read_bytes() == (whole / "model.ddprt" / file).read_bytes()
@@ -106,6 +107,20 @@ def test_changed_settings_train_anew_and_it_is_said(
     assert "trains anew" not in capsys.readouterr().err, "a finished training leaves nothing in the way"
 
 
+def test_what_cannot_be_fitted_is_told_before_anything_is(
+    baked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Settings of a method that there is not, and another process in the folder."""
+    run, job = tmp_path / "run", baked / "job.toml"
+    shutil.copytree(baked / "run", run)
+    assert call("fit", job, "--out", run, "--methods.settings.neural_lightmap", "{steps = 3}") == 2
+    assert 'ddprt: no method "neural_lightmap"; did you mean "neural-lightmap"?' in capsys.readouterr().err
+    with alone_in(run):
+        assert call("fit", job, "--out", run, *WORDS) == 2
+    assert "another command is working in this folder" in capsys.readouterr().err
+    assert not (run / "model.ddprt").exists()
+
+
 def test_divergence_is_explained_wherever_a_result_is_told(
     baked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -117,7 +132,7 @@ def test_divergence_is_explained_wherever_a_result_is_told(
     assert call("eval", baked / "job.toml", "--out", run, *huge, *less) == 0
     expected = re.compile(
         r"the (loss|gradient|validation loss) was not finite by step 20, at a learning rate of \d\S+e\+\d\d; "
-        r"the parameters it began with are kept"
+        r"nothing was looked at before, a smaller check_every tells more; the parameters it began with are kept"
     )
     told = capsys.readouterr().err
     assert re.search(rf"mlp: {expected.pattern}", told)

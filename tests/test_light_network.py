@@ -1,5 +1,6 @@
 """The network that is told the lights: what it is told, that light adds up, and that it learns where lamps are."""
 
+import warnings
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +16,7 @@ from ddprt.errors import UserError
 from ddprt.lights import PointLight, parse_lighting
 from ddprt.methods.light_network import LightNetwork, LightNetworks, Surroundings
 from ddprt.methods.method import Examples, Frame
+from ddprt.progress import Doubt
 
 AROUND = Surroundings(np.array([1.0, 2.0, 3.0]), 2.0)
 POSITIONS = np.random.default_rng(5).uniform(0, 1, (12, 3))
@@ -107,7 +109,20 @@ def test_every_kind_of_lamp_is_told(kind: str, network: LightNetwork) -> None:
     np.testing.assert_allclose(told[6:8], [1, 0.5] if kind == "spot" else [-1, -1], atol=1e-12)
     reach = {"rect": np.hypot(0.5, 0.25), "mesh": np.hypot(0.5, 0.25), "sphere": 0.5}.get(kind, 0.0)
     np.testing.assert_allclose(told[8:], [kind in ("rect", "mesh"), kind != "directional", reach / 2], atol=1e-12)
-    assert np.isfinite(network.describe([(light,)])).all()
+    assert np.isfinite(replace(network, kinds=kind).describe([(light,)])).all()
+
+
+def test_a_kind_that_training_never_showed_is_doubted(network: LightNetwork) -> None:
+    """A sky is told as directional lights, and is known where these are."""
+    assert network.kinds == "point"
+    lights = [parse_lighting(LAMPS[kind]) for kind in ("spot", "directional", "point")]
+    sky = SimpleNamespace(kind="environment", harmonics=lambda order: np.ones((harmonics.count(order), 3)))
+    with pytest.warns(Doubt, match="got light of type directional, spot, but was trained with point alone"):
+        network.describe(lights)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        network.describe([lights[2], ()])
+        replace(network, kinds="directional,spot").describe([lights[0] + lights[1], lights[0] + (sky,)])
 
 
 @pytest.mark.parametrize(("radii", "share"), [(0.0, 1.0), (0.5, 1.0), (1.0, 1.0), (2.0, 1 / 4), (10.0, 1 / 100)])

@@ -189,3 +189,105 @@ def test_whoever_is_imported_before_ddprt_is_there_when_asked_for(monkeypatch: p
     monkeypatch.setattr(spec, "_initializing", False)
     assert isinstance(make_method("late", {}, {}), Late)
     assert METHODS["late"] is Late
+
+
+SICK = """
+import sys
+import jax.numpy as jnp
+from ddprt.methods.floors import MeanLightmap, MeanMap
+from ddprt.methods.method import Method
+
+class Mean(Method):
+    relighter = MeanMap
+    why = "none"
+
+    def fit(self, train, validation, *, key):
+        return MeanLightmap().fit(train, validation, key=key)
+
+class Raises(Mean):
+    def fit(self, train, validation, *, key):
+        raise ZeroDivisionError("oh\\nno")
+
+class Leaves(Mean):
+    def fit(self, train, validation, *, key):
+        sys.exit(3)
+
+class Nothing(Mean):
+    def fit(self, train, validation, *, key):
+        return None
+
+class Shape(Mean):
+    def fit(self, train, validation, *, key):
+        fitted = super().fit(train, validation, key=key)
+        return type(fitted)(fitted.mean[:-1], fitted.report)
+
+class Nan(Mean):
+    def fit(self, train, validation, *, key):
+        fitted = super().fit(train, validation, key=key)
+        return type(fitted)(fitted.mean * jnp.nan, fitted.report)
+"""
+FAULTS = {
+    "raises": r"got ZeroDivisionError: oh no;",
+    "leaves": r"got SystemExit: 3;",
+    "nothing": r"got \w+Error: .*;",
+    "shape": r"got \w+Error: .*;",
+    "not-a-number": r"got FloatingPointError: answers of NaN for 2 of 2 validation lightings;",
+}
+
+
+@pytest.fixture(scope="module")
+def sick(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A package whose methods can be imported and not used."""
+    folder = tmp_path_factory.mktemp("sick")
+    about = folder / "sick_methods-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: sick-methods\nVersion: 1.0\n")
+    classes = {**{name: name.capitalize() for name in FAULTS}, "not-a-number": "Nan"}
+    lines = "".join(f"{name} = sick_methods:{kind}\n" for name, kind in classes.items())
+    (about / "entry_points.txt").write_text(f"[ddprt.methods]\n{lines}")
+    (folder / "sick_methods.py").write_text(SICK)
+    return folder
+
+
+@pytest.fixture
+def sickly(sick: Path, clean: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Its methods, registered within this process."""
+    monkeypatch.syspath_prepend(str(sick))
+    before = set(METHODS)
+    packages.register(METHODS)
+    yield
+    for name in set(METHODS) - before:
+        METHODS.pop(name)
+    sys.modules.pop("sick_methods", None)
+
+
+@pytest.mark.usefixtures("sickly")
+def test_faults_of_a_package_s_method_are_its_own_and_leave_the_rest(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One line that names method and package, and exit 2; what else was asked for is there."""
+    job, run = tmp_path / "job.toml", tmp_path / "run"
+    job.write_text(SMALL)
+    assert call("bake", job, "--out", run, "--quiet") == 0
+    for name, fault in FAULTS.items():
+        assert call("fit", job, "--out", run, "--fit.method", name, "--methods.compare", "[]") == 2
+        last = capsys.readouterr().err.splitlines()[-1]
+        assert re.fullmatch(rf'ddprt: method "{name}" of package sick-methods: {fault} mend or leave it out', last), last
+    assert call("fit", job, "--out", run, "--methods.compare", '["raises"]') == 2
+    assert (run / "model.ddprt" / "model.json").is_file()
+    words = ["--leagues.methods", '["raises", "not-a-number"]', "--leagues.trials", "1", "--leagues.seeds", "1"]
+    assert call("bench", job, "--out", run, "--leagues", *words) == 0
+    told = (run / "bench" / "leagues.md").read_text()
+    for name in ("raises", "not-a-number"):
+        assert re.search(rf'\| {name} \|.*method "{name}" of package sick-methods: {FAULTS[name][:-1]}', told)
+
+
+@pytest.mark.usefixtures("sickly")
+def test_a_fault_of_ours_is_not_blamed_on_packages() -> None:
+    with pytest.raises(ZeroDivisionError), packages.blamed("svd-ridge"):
+        raise ZeroDivisionError
+    with pytest.raises(UserError, match=r"^ours$"), packages.blamed("raises"):
+        raise UserError("ours")
+    cut = r'method "raises" of package sick-methods: got ValueError: x{300}\.\.\.; '
+    with pytest.raises(UserError, match=cut), packages.blamed("raises"):
+        raise ValueError("x" * 1000)

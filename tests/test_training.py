@@ -284,6 +284,22 @@ def test_numbers_that_are_not_finite_end_training_and_are_explained(tmp_path: Pa
     assert not (tmp_path / "line.safetensors").exists()
 
 
+def test_what_diverges_leaves_nothing_worse_than_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After looks that are finite and far off, and one that is not."""
+    whole = loop._round
+
+    def bad(*arguments: Any) -> Any:
+        state, seen = whole(*arguments)
+        return state, seen.at[2].set(jnp.inf) if int(state.step) == 60 else seen
+
+    monkeypatch.setattr(loop, "_round", bad)
+    far = trained(SCHEDULE.model_copy(update={"learning_rate": 1e4}))
+    assert min(look.validation for look in far.history) > 1e5
+    assert far.trouble.endswith("the parameters it began with are kept")
+    begun = Line().initial(pairs(0), jax.random.split(jax.random.key(0))[0])
+    assert bits(far) == [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(begun)]
+
+
 def test_patience_ends_training_that_gets_no_better() -> None:
     frozen = {**pairs(0), "y": jnp.full(64, jnp.float32(5))}  # leads away from what is held out
     patient = SCHEDULE.model_copy(update={"patience": 3})

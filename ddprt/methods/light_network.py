@@ -14,7 +14,8 @@ Areas are told by their centre, their mean direction and their reach; a sky is t
 up to `SKY` make, so a method that was trained under suns answers for it.
 """
 
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
@@ -32,6 +33,7 @@ from ddprt.fitting.transfer import Transfer, solve_transfer
 from ddprt.methods.learned import Learned, Seen, told
 from ddprt.methods.method import Examples, FitReport, Frame, array_bytes, as_pytree, columns, found_in, static
 from ddprt.methods.svd_ridge import compose
+from ddprt.progress import Doubt
 
 SKY = 6
 """Order of the harmonics that a sky is told by."""
@@ -67,7 +69,6 @@ class Surroundings:
 
         A strength is what parallel light brings, or a lamp at the centre of the points if it shone there; of lamps nearer than
         a radius, where that has no bounds, what they bring at one. So less is left to learn of how light falls off.
-
 
         Raises:
           UserError: a kind that is not known here.
@@ -145,10 +146,13 @@ class LightNetwork:
     centre: Float[Array, "3"]
     radius: Float[Array, ""]
     groups: int = static(default=3)
+    kinds: str = static(default="")  # of light that it was trained with, with commas; nothing where that is not known
     report: FitReport = field(default=FitReport(), compare=False)
 
     def describe(self, lightings: Sequence[Any]) -> Float64[np.ndarray, "lightings bases 3"]:
         """See `AsksForLights`: coefficients of the basis, each colour of light apart.
+
+        A kind of light that training never showed is told as a `Doubt`.
 
         Raises:
           UserError: a kind of light that is not known.
@@ -160,6 +164,9 @@ class LightNetwork:
             if lobes := [lobe for light in lights for lobe in around.lobes(light)]:
                 strength, told = (np.stack(part) for part in zip(*lobes, strict=True))
                 row += np.einsum("lc,lf,cfb->bc", strength, _features(told, B, b), A, optimize=True)
+        if self.kinds and (unseen := ", ".join(sorted(_kinds(lightings) - {*self.kinds.split(",")}))):
+            words = f"light-network: got light of type {unseen}, but was trained with {self.kinds.replace(',', ', ')} alone"
+            warnings.warn(f"{words}; what it answers is a guess", Doubt, stacklevel=2)
         return found
 
     def predict(self, frame: Frame) -> Float[Array, "frames texels 3"]:
@@ -296,8 +303,9 @@ class LightNetworks(Learned):
         report = replace(report, numerical_rank=basis.rank, singular_values=tuple(np.asarray(basis.singular_values).tolist()))
         report = report.noting(*found_in(train), basis.status)
         groups, place = lit.targets.shape[1], (jnp.asarray(around.centre, jnp.float32), jnp.float32(around.radius))
+        kinds = ",".join(sorted(_kinds(train.frame.lightings or ())))
         if not lit.targets.any():
-            return LightNetwork(*_single(start), basis.vectors, *place, groups, report.noting("no_signal"))
+            return LightNetwork(*_single(start), basis.vectors, *place, groups, kinds, report.noting("no_signal"))
         spread = np.maximum(np.sqrt(np.mean(lit.targets**2, (0, 1))), 1e-12 * np.abs(lit.targets).max())
         begun = _single(start._replace(outputs=start.outputs / spread))
         problem = Refining(report.ridge[0])
@@ -307,7 +315,7 @@ class LightNetworks(Learned):
         best = trained.parameters if bool(gains) else begun
         outputs = jnp.asarray(np.asarray(best.outputs, np.float64) * spread, jnp.float32)
         report = told(report, trained)
-        return LightNetwork(best.frequencies, best.phases, outputs, basis.vectors, *place, groups, report)
+        return LightNetwork(best.frequencies, best.phases, outputs, basis.vectors, *place, groups, kinds, report)
 
     def _start(self, lit: Lit, key: Array) -> tuple[Cosines, FitReport]:
         """Random frequencies and the ridge's outputs, of the length that predicts left-out lightings best."""
@@ -348,6 +356,11 @@ def _solved(lit: Lit, B: np.ndarray, b: np.ndarray, ridge: float | str) -> tuple
         leave_one_out=tuple(one.leave_one_out for one in solved),
     ).noting(*remarks, *(choice.remarks if choice else ()))
     return Cosines(B, b, outputs), report  # type: ignore[arg-type]
+
+
+def _kinds(lightings: Iterable[Iterable[Any]]) -> set[str]:
+    """What is told apart: a sky is told as directional lights."""
+    return {"directional" if light.kind == "environment" else light.kind for lights in lightings for light in lights}
 
 
 def _features(told: Float64[np.ndarray, "*n told"], B: np.ndarray, b: np.ndarray) -> Float64[np.ndarray, "*n features"]:

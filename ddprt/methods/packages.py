@@ -7,6 +7,8 @@ its method hears why. Names of methods that are there already stay with these.
 import re
 import sys
 import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib.metadata import EntryPoint, entry_points
 
 from ddprt.errors import UserError
@@ -20,12 +22,14 @@ ORIGINS: dict[str, str] = {}
 REFUSED: dict[str, str] = {}
 """Names that other packages offered in vain, and why."""
 
+_WORDS = 300  # letters of a message that is not ours
+
 _postponed: list[EntryPoint] = []  # of modules that import this one and are not through yet
 
 
 def register(methods: dict[str, type[Method]]) -> None:
     """Adds the methods of all installed packages; whoever is just being imported comes with `register_postponed`."""
-    _take(methods, entry_points(group=GROUP))
+    _take(methods, tuple(entry_points(group=GROUP)))
 
 
 def register_postponed(methods: dict[str, type[Method]]) -> None:
@@ -34,7 +38,7 @@ def register_postponed(methods: dict[str, type[Method]]) -> None:
     _take(methods, waiting)
 
 
-def _take(methods: dict[str, type[Method]], points: "list[EntryPoint] | tuple[EntryPoint, ...]") -> None:
+def _take(methods: dict[str, type[Method]], points: Sequence[EntryPoint]) -> None:
     for point in points:
         spec = getattr(sys.modules.get(point.module), "__spec__", None)
         if getattr(spec, "_initializing", False):
@@ -69,5 +73,28 @@ def _method(point: EntryPoint, methods: dict[str, type[Method]]) -> type[Method]
     missing = [name for name, kind in (("relighter", type), ("why", str)) if not isinstance(getattr(found, name, None), kind)]
     missing += ["fit"] if found.fit is Method.fit else []
     if missing:
-        raise UserError(f"got a class without {' and '.join(missing)}, expected them; see docs/methods.md")
+        raise UserError(f"got a class without {' and '.join(missing)}, expected all that docs/methods.md asks for; add it")
     return found
+
+
+@contextmanager
+def blamed(name: str) -> Iterator[None]:
+    """Whatever goes wrong within, in a method of another package, is told in one line that names both.
+
+    Args:
+      name: of the method; errors of those that come with ddprt pass as they are.
+    Raises:
+      UserError: in place of any other error.
+    """
+    try:
+        yield
+    except (UserError, MemoryError):
+        raise
+    except (Exception, SystemExit) as error:  # of whatever kind: it is not our code
+        if name not in ORIGINS:
+            raise
+        words = " ".join(str(error).split())
+        words = f": {words[:_WORDS]}{'...' * (len(words) > _WORDS)}" if words else ""
+        raise UserError(
+            f'method "{name}" of package {ORIGINS[name]}: got {type(error).__name__}{words}; mend or leave it out'
+        ) from error

@@ -104,22 +104,22 @@ def growth_figure(curves: Mapping[str, Sequence[tuple[int, Float64[np.ndarray, "
     """Error of each method over a number that grows, and one standard deviation over seeds to both sides.
 
     Args:
-      curves: (number, relative RMSE of each seed) by method, the baseline first.
+      curves: (number, relative RMSE of each seed) by method, the baseline first; those without any are left out.
       axis: what the number is of.
     """
 
     def draw(axes: Any) -> None:
         from matplotlib.ticker import NullLocator
 
-        for name, (colour, mark) in looks(list(curves)).items():
-            found = sorted(curves[name], key=lambda pair: pair[0])
-            if not found:
-                continue
+        known = {name: sorted(curve, key=lambda pair: pair[0]) for name, curve in curves.items() if curve}
+        for order, (name, (colour, mark)) in enumerate(looks(list(known)).items()):
+            found = known[name]
             at, mean = [number for number, _ in found], np.array([100 * errors.mean() for _, errors in found])
             spread = np.array([100 * errors.std(ddof=1) if len(errors) > 1 else 0.0 for _, errors in found])
-            axes.errorbar(at, mean, spread, fmt=f"{mark}-", color=colour, label=name, linewidth=1, elinewidth=0.7)
+            axes.errorbar(at, mean, spread, fmt=f"{mark}-", color=colour, label=name, linewidth=1, elinewidth=0.7,
+                          zorder=3 if order else 4)  # fmt: skip  # the baseline lies on top
         axes.set(xlabel=axis, ylabel="relative RMSE (%)", xscale="log", yscale="log")
-        axes.set_xticks(sorted({number for curve in curves.values() for number, _ in curve}))
+        axes.set_xticks(sorted({number for curve in known.values() for number, _ in curve}))
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_locator(NullLocator())
         _plain(axes.yaxis)

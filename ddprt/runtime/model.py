@@ -19,6 +19,7 @@ from ddprt.fitting.encoding import Encoding
 from ddprt.lights import Light, Lighting, parse_lighting
 from ddprt.methods.learned import TakesAnyPoints
 from ddprt.methods.method import AsksForLights, Frame, Relighter
+from ddprt.methods.packages import ORIGINS, blamed
 from ddprt.runtime.coefficients import Coefficients
 from ddprt.runtime.trust import Trust, Yardstick
 from ddprt.sampling.points import Samples
@@ -108,16 +109,20 @@ class Model:
         frames, single = self._frames(values, None if chosen is None else len(chosen))
         if not isinstance(clamp, bool | np.bool_ | str) or clamp not in (True, False, "energy"):
             raise UserError(f'clamp: got {clamp!r}, expected True, False or "energy"')
-        if fade and self.yardstick is None:
-            raise UserError("fade: got a model of an older version, which knows no trust; fit it again")
         area = self._shares if clamp == "energy" else None
-        told = self._described(lightings, len(frames), single) if isinstance(self.relighter, AsksForLights) else None
+        with blamed(self.method):
+            told = self._described(lightings, len(frames), single) if isinstance(self.relighter, AsksForLights) else None
         if fade and told is not None:
             raise UserError(f"fade: got True for {self.method}, which answers from lights; leave it out, or fit svd-ridge")
+        if fade and self.yardstick is None:
+            raise UserError("fade: got a model of an older version, which knows no trust; fit it again")
         if fade and chosen is not None:
             raise UserError("fade: got True with points, but trust is measured by all of them; leave one of the two out")
         places = self._places if chosen is None else (self._places[0][chosen], self._places[1][chosen])
-        light = np.asarray(_relight(self.relighter, self.encoding, frames, told, *places, bool(clamp), area))
+        with blamed(self.method):
+            light = np.asarray(_relight(self.relighter, self.encoding, frames, told, *places, bool(clamp), area))
+            if self.method in ORIGINS and not np.isfinite(light).all():
+                raise FloatingPointError("answers that are not finite")
         if fade and self.yardstick is not None:
             kept = self.yardstick.kept(self.yardstick.measure(self.encoding, frames).score)[:, None, None]
             scale = np.asarray(self.encoding.scale(frames), np.float64)[:, None]
@@ -164,6 +169,8 @@ class Model:
 
     def trust(self, values: Any) -> Trust | None:
         """How far measured light lies from what the model was trained on, and what error to expect; None in older models.
+
+        It goes by measurements alone: of a method that answers from lights, for kinds of light that it was trained with.
 
         Args:
           values: as for `predict`. Lamps that no measurement point sees are not told from lamps that are off.

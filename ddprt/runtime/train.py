@@ -23,6 +23,7 @@ from ddprt.fitting.encoding import Encoding
 from ddprt.methods import make_method
 from ddprt.methods.floors import MeanLightmap, MeanMap
 from ddprt.methods.method import AsksForLights, Examples, FitReport, Frame, Maps, Method, Relighter, block_texels, unseen_share
+from ddprt.methods.packages import blamed
 from ddprt.methods.statuses import BLIND
 from ddprt.runtime.model import LayerModel, Model
 from ddprt.runtime.programs import make_room
@@ -114,8 +115,9 @@ def fit_method(
     encoding = Encoding(getattr(method, "space", config.space), config.gamma, config.channels)
     pack = _streamed(data, method, name, stream)
     train, validation = (examples(data, split, encoding, config, points, quantity, pack) for split in ("train", "validation"))
-    relighter = method.fit(train, validation, key=jax.random.key(seeds.number(seed, f"method {name}")))
-    relighter, yardstick = judged(relighter, encoding, train, validation)
+    with blamed(name):
+        relighter = method.fit(train, validation, key=jax.random.key(seeds.number(seed, f"method {name}")))
+        relighter, yardstick = judged(relighter, encoding, train, validation)
 
     def of_layer(layer: Layer) -> LayerModel:
         part = LayerData.of(data, layer)
@@ -163,9 +165,15 @@ def _with_trouble_of(relighter: Relighter, of_layers: Mapping[str, FitReport]) -
 
 
 def judged(relighter: Relighter, encoding: Encoding, train: Examples, validation: Examples) -> tuple[Relighter, Yardstick]:
-    """The laws that a method beats mean lightmap and black on its validation set and was trained on its kind, or says not."""
+    """The laws that a method beats mean lightmap and black on its validation set and was trained on its kind, or says not.
+
+    Raises:
+      FloatingPointError: its answers are no numbers, which no method may do.
+    """
     mean = _mean_lightmap(train, validation)
     ours, floor, whole = (_squares(one, encoding, validation) for one in (relighter, mean, None))
+    if np.isnan(ours).any():
+        raise FloatingPointError(f"answers of NaN for {np.isnan(ours).sum()} of {len(ours)} validation lightings")
     yardstick = make_yardstick(train, encoding)
     novelty = yardstick.novelty(validation.frame.values, validation.scale)
     lit = whole > 0

@@ -154,6 +154,8 @@ class Journal:
         if self.where.stage is not None:
             self.where.stage.pace(self.where.stage.done + self.schedule.round * self.schedule.rounds)
             self.where.stage.advance(found, found=True)
+            if found:
+                self.where.stage.facts["went_on_from_step"] = found
         return state, history
 
     def add(self, entry: Entry, state: Any, history: Sequence[Entry]) -> None:

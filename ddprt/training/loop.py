@@ -92,11 +92,19 @@ def train(
             history.append(entry)
             trouble = _trouble(history)
             log.add(entry, state, history)
-    return Trained(state.best, tuple(history), trouble)
+    if not trouble:
+        return Trained(state.best, tuple(history))
+    begun = _begin(problem, schedule.by, first, start_key).parameters
+    looks = [look for look in history if np.isfinite(look.validation)]
+    best = min(looks, key=lambda look: look.validation, default=None)
+    if best is None or best.validation > float(problem.check(begun, held)):
+        return Trained(begun, tuple(history), f"{trouble}; the parameters it began with are kept")
+    kept = f"of step {best.step}, with a validation loss of {best.validation:.3g}"
+    return Trained(state.best, tuple(history), f"{trouble}; the parameters {kept} are kept")
 
 
 def _trouble(history: Sequence[Entry]) -> str:
-    """What is not finite at the last look, what was seen before it, and which parameters are left; empty where all is well."""
+    """What is not finite at the last look, and what was seen before it; empty where all is well."""
     if not history or np.isfinite((history[-1].loss, history[-1].validation, history[-1].gradient)).all():
         return ""
     entry, earlier = history[-1], history[:-1]
@@ -107,10 +115,8 @@ def _trouble(history: Sequence[Entry]) -> str:
         first, last = earlier[0], earlier[-1]
         told += f"; by step {last.step} the loss was {last.loss:.3g} ({first.loss:.3g} by step {first.step})"
         told += f" and its gradient had a norm of {last.gradient:.3g}"
-    looks = [look for look in history if np.isfinite(look.validation)]
-    best = min(looks, key=lambda look: look.validation, default=None)
-    kept = f"of step {best.step}, with a validation loss of {best.validation:.3g}" if best else "it began with"
-    return f"{told}; the parameters {kept} are kept"
+        return told
+    return f"{told}; nothing was looked at before, a smaller check_every tells more"
 
 
 @partial(jax.jit, static_argnums=(0, 1))

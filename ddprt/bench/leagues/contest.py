@@ -23,7 +23,7 @@ from ddprt.bench.measure.trial import environment, frame_seconds, measured_here,
 from ddprt.config import Config
 from ddprt.dataset.store import Dataset
 from ddprt.errors import UserError
-from ddprt.files import append_line
+from ddprt.files import append_line, write_text
 from ddprt.progress import Progress
 from ddprt.report.metrics import Tally
 from ddprt.runtime.model import Model
@@ -209,9 +209,15 @@ def spoken(settings: Mapping[str, Any]) -> str:
 
 
 def known(path: Path, progress: Progress) -> dict[str, Record]:
-    """Whole records of a machine and version like these, by what they are of; the last one of each."""
+    """Whole records of a machine and version like these, by what they are of; the last one of each.
+
+    Half a line, which whoever was killed left behind, goes from the file.
+    """
     lines = path.read_text("utf-8").splitlines() if path.is_file() else []
-    found = [record for line in lines if _whole(record := _from_json(line))]
+    records = [_from_json(line) for line in lines]
+    if None in records:
+        write_text(path, "".join(f"{line}\n" for line, record in zip(lines, records, strict=True) if record is not None))
+    found = [record for record in records if _whole(record)]
     if len(found) < len(lines):
         progress.say(
             f"{path.name}: {len(found)} of {len(lines)} lines are whole and of this machine and version; others do not count"

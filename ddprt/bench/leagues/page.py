@@ -67,7 +67,7 @@ def write_pages(
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    found = words.findings(table, budgets, title, trials, seeds)
+    found = [*words.findings(table, budgets, title, trials, seeds), *words.failures(records)]
     write_text(folder / TABLE, words.markdown(table, budgets, found, title))
     lightings = next(record for record in records if record["what"] == "data")["lightings"]
     names = _names(table)

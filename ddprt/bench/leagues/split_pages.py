@@ -24,7 +24,7 @@ class Found:
       cannot: why nothing came out; nothing where something did.
       sides: labels of what was asked, the first what the others are compared with.
       rows: of each method its cells, one for each side.
-      words: about the sides after the first.
+      words: about the sides, but for the first where it is only there to be compared with.
       curve: SVG of error over what grows, of a split that is a curve; nothing of others.
     """
 
@@ -62,7 +62,7 @@ def _told(name: str, records: Sequence[Record]) -> Found:
         split.question,
         sides=sides,
         rows=[(method, [_cell(cells[method, side], cells[BASELINE, side]) for side in sides]) for method in methods],
-        words=[_sentence(side, {method: cells[method, side] for method in methods}) for side in sides[1:]],
+        words=[_sentence(side, {method: cells[method, side] for method in methods}) for side in sides[not split.axis :]],
         curve=_curve(split.axis, {method: [cells[method, side] for side in sides] for method in methods}) if split.axis else "",
     )
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from ddprt.axes import Float64
 from ddprt.bench.leagues.search import BASELINE
@@ -14,7 +15,6 @@ from ddprt.sections import LeaguesConfig
 Record = Mapping[str, Any]
 SLACK = 1.5  # of the seconds: times of one and the same fit differ by that much on a machine that others use
 _DRAWS = 2000  # of the held-out lightings, with repetition
-_SURE = 2.0  # standard errors over held-out lightings
 _SMALL = 5e-4  # a difference that tables round to 0.0 % is none, however sure
 
 
@@ -72,7 +72,8 @@ class Difference:
     Attributes:
       mean: over seeds.
       spread: standard deviation over seeds; None for a single one.
-      doubt: standard error that the choice of held-out lightings leaves, by drawing them with repetition.
+      doubt: half of the interval that holds the mean of all lightings with 95 % probability, by drawing the held-out ones with
+        repetition; infinite for a single one.
     """
 
     mean: float
@@ -84,7 +85,7 @@ class Difference:
         """ "better", "worse" or "within the spread"; of one seed nothing is claimed."""
         if self.spread is None:
             return "one seed"
-        if abs(self.mean) <= max(self.spread, _SURE * self.doubt, _SMALL):
+        if abs(self.mean) <= max(self.spread, self.doubt, _SMALL):
             return "within the spread"
         return "better" if self.mean < 0 else "worse"
 
@@ -202,7 +203,8 @@ def difference(own: Sequence[Record], base: Sequence[Record], rows: Sequence[int
     rng = np.random.default_rng(len(rows))
     drawn = np.asarray(rows)[rng.integers(len(rows), size=(_DRAWS, len(rows)))]
     other = _drawn(own, drawn) / np.maximum(_drawn(base, drawn), 1e-30) - 1
-    doubt = float(np.nanstd(other.mean(0))) if len(rows) > 1 else float("inf")
+    few = len(rows)  # draws vary too little by (n - 1) / n, and of few lightings that is not known well: Student's t
+    doubt = float(np.nanstd(other.mean(0)) * (few / (few - 1)) ** 0.5 * stats.t.ppf(0.975, few - 1)) if few > 1 else np.inf
     return Difference(float(over.mean()), float(over.std(ddof=1)) if len(over) > 1 else None, doubt)
 
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 from ddprt.bench.leagues.contest import spoken
 from ddprt.bench.leagues.search import BASELINE
-from ddprt.bench.leagues.standings import LEAGUES, Budgets, Difference, Place
+from ddprt.bench.leagues.standings import LEAGUES, Budgets, Difference, Place, Record
 from ddprt.report import words
 
 _FORMS = {"bytes": words.size, "count": words.count, "seconds": words.seconds}
@@ -80,14 +80,27 @@ def findings(table: Mapping[str, Sequence[Place]], budgets: Budgets, scene: str,
         line += f" Out: {', '.join(out)}." if out else ""
         told.append(line)
     names = "; ".join(f"{name} (leagues of {' and '.join(titles)})" for name, titles in won.items())
-    whole = f"On {scene}, with {trials} trials each and {seeds} seeds, "
+    whole = f"On {scene}, with up to {trials} trials each and {seeds} seeds, "
     if seeds < 2:
         whole += "one seed has no spread: no claim is made."
     else:
         whole += f"the baseline is beaten by more than the spread by {names}." if won else (
             "the linear baseline is not beaten by more than the spread in any league."
         )  # fmt: skip
+    everywhere = [{place.method for place in places if not place.errors} for places in table.values()]
+    if out := sorted(set.intersection(*everywhere) - {BASELINE}):
+        whole += f" In no league at all: {', '.join(out)}."
     return [whole, *told]
+
+
+def failures(records: Sequence[Record]) -> list[str]:
+    """A sentence for each method of which some trials could not be done; of whom none could be, the tables say it."""
+    told, trials = [], [record for record in records if record["what"] == "trial"]
+    for method in dict.fromkeys(record["method"] for record in trials):
+        own = [record for record in trials if record["method"] == method]
+        if 0 < len(failed := [record["failed"] for record in own if record["failed"]]) < len(own):
+            told.append(f"{len(failed)} of {len(own)} trials of {method} could not be done; the first: {failed[0]}.")
+    return told
 
 
 def _where(place: Place) -> str:
