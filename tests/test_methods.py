@@ -294,7 +294,14 @@ BAD = {
         ("mlp", {"settings": {"widht": 3}}),
         'methods.settings.mlp.widht: unknown setting; did you mean "width"?',
     ),
-    "setting out of range": (("mlp", {"settings": {"steps": 0}}), "methods.settings.mlp.steps: got 0"),
+    "setting out of range": (
+        ("mlp", {"settings": {"steps": 0}}),
+        "methods.settings.mlp.steps: got 0, expected greater than or equal to 1; raise it",
+    ),
+    "setting of another type": (
+        ("point-set", {"settings": {"ridge": "atuo"}}),
+        "methods.settings.point-set.ridge: got 'atuo', expected 'auto' or number; did you mean \"auto\"?",
+    ),
     "bases": (("svd-ridge", {"bases": 0}), "--fit.bases: got 0"),
     "ridge": (("svd-ridge", {"ridge": -1.0}), "--fit.ridge: got -1.0"),
     "ridge per point": (("svd-ridge", {"ridge": (1.0, 2.0)}), "got 2 values, expected one per measurement"),

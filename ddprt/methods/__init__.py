@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from ddprt.catalogue import Catalogue
-from ddprt.errors import UserError, nearest
+from ddprt.errors import UserError, explain, nearest
 from ddprt.methods import packages
 from ddprt.methods.autoencoder import Autoencoder
 from ddprt.methods.floors import MeanLightmap, NearestLighting
@@ -80,9 +80,11 @@ def make_method(name: str, shared: Mapping[str, Any], own: Mapping[str, Any]) ->
     try:
         return method(**{**{key: value for key, value in shared.items() if key in known}, **own})
     except ValidationError as error:
-        fault = error.errors()[0]
-        place = ".".join(map(str, fault["loc"]))
-        raise UserError(f"methods.settings.{name}.{place}: got {fault['input']!r}, expected: {fault['msg']}") from None
+        faults = error.errors()
+        # Several where a value may be of several kinds.
+        of_one = [fault for fault in faults if fault["loc"][:1] == faults[0]["loc"][:1]]
+        place = ".".join(map(str, faults[0]["loc"][:1]))
+        raise UserError(f"methods.settings.{name}.{place}: {explain(of_one)}") from None
 
 
 __all__ = ["METHODS", "Method", "known_methods", "make_method", "method_named"]
