@@ -2,6 +2,7 @@
 
 import hashlib
 import tempfile
+import time
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -21,6 +22,7 @@ _STEPS = 14  # of the bisection: texel density is met to 1e-4
 _FINE, _USUAL, _LESS = 2e-3, 0.8, 0.85  # for patches: how close density is met; begin of the search against full cover; step
 _TOUCHING = 1e-5  # of a chart's size: overlap of two triangles in xatlas' float32 that is none
 _MAGNIFIED = 4096.0
+_ASLEEP = 0.002  # seconds until xatlas' threads sleep: its destructor waits for ever for one about to
 _FORMAT = "2"  # part of the cache key: raise it when the unwrapping changes
 
 
@@ -92,6 +94,7 @@ def _charts(scene: Scene, positions: np.ndarray, chosen: np.ndarray) -> tuple[np
     charts = xatlas.Atlas()
     charts.add_mesh(positions, triangles.astype(np.uint32), normals.astype(np.float32))
     charts.generate()
+    time.sleep(_ASLEEP)
     _, corners, uv = charts[0]
     _, chart_of_vertex = charts.get_mesh_vertex_assignment(0)
     if charts.atlas_count != 1:
@@ -166,6 +169,7 @@ def _pack(
     options = xatlas.PackOptions()
     options.resolution, options.texels_per_unit, options.padding = resolution, density / scale, padding
     atlas.generate(pack_options=options)
+    time.sleep(_ASLEEP)
     if atlas.atlas_count != 1 or max(atlas.width, atlas.height) > resolution:
         return None
     vertex, order, uv = atlas[0]
