@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 import tomllib
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ddprt import cli
 from ddprt.cli import LATER, VERBS, WHOLE, main, parse
 from ddprt.config import keys, load_config
+from ddprt.progress import Doubt
 from ddprt.scene.exr import read_exr
 
 SMALL = """
@@ -518,3 +521,10 @@ def test_settings_in_no_section_are_options_of_their_own() -> None:
     config = load_config(None, call.overrides)
     assert config.sweep == {"fit.bases": (4, 8), "fit.space": ("gamma",)}
     assert config.seed == 3
+
+
+def test_a_doubt_is_said_once(capsys: pytest.CaptureFixture[str]) -> None:
+    with cli._doubts_in_one_line():
+        for words in ("one", "two", "one"):
+            warnings.warn(words, Doubt, stacklevel=1)
+    assert capsys.readouterr().err == "warning: one\nwarning: two\n"

@@ -5,17 +5,22 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
+import jax.numpy as jnp
+import numpy as np
 import pytest
 from small_job import SMALL, call
 
 from ddprt.errors import UserError
 from ddprt.methods import METHODS, make_method, packages
+from ddprt.methods.floors import MeanMap
 from ddprt.methods.listing import table
 from ddprt.methods.method import Method
 from ddprt.progress import Doubt
+from ddprt.runtime.model_file import load_model
 
 DOCS = (Path(__file__).parent.parent / "docs" / "methods.md").read_text("utf-8")
 
@@ -38,14 +43,20 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return target
 
 
+def as_installed(folder: Path, package: str, points: dict[str, str]) -> Path:
+    """What pip writes beside a package, so that its entry points are found."""
+    about = folder / f"{package.replace('-', '_')}-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[ddprt.methods]\n" + "".join(f"{name} = {at}\n" for name, at in points.items()))
+    return folder
+
+
 @pytest.fixture(scope="module")
 def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A package as installed, whose entry points are all at fault."""
-    folder = tmp_path_factory.mktemp("faulty")
-    about = folder / "faulty_methods-1.0.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: faulty-methods\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text("[ddprt.methods]\nbroken = faulty_broken:Broken\nmlp = faulty_clash:Mlp\n")
+    points = {"broken": "faulty_broken:Broken", "mlp": "faulty_clash:Mlp"}
+    folder = as_installed(tmp_path_factory.mktemp("faulty"), "faulty-methods", points)
     (folder / "faulty_broken.py").write_text('raise RuntimeError("no\\nluck")\n')
     (folder / "faulty_clash.py").write_text("raise AssertionError('a taken name is not even imported')\n")
     return folder
@@ -238,13 +249,9 @@ FAULTS = {
 @pytest.fixture(scope="module")
 def sick(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A package whose methods can be imported and not used."""
-    folder = tmp_path_factory.mktemp("sick")
-    about = folder / "sick_methods-1.0.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: sick-methods\nVersion: 1.0\n")
     classes = {**{name: name.capitalize() for name in FAULTS}, "not-a-number": "Nan"}
-    lines = "".join(f"{name} = sick_methods:{kind}\n" for name, kind in classes.items())
-    (about / "entry_points.txt").write_text(f"[ddprt.methods]\n{lines}")
+    points = {name: f"sick_methods:{kind}" for name, kind in classes.items()}
+    folder = as_installed(tmp_path_factory.mktemp("sick"), "sick-methods", points)
     (folder / "sick_methods.py").write_text(SICK)
     return folder
 
@@ -263,7 +270,7 @@ def sickly(sick: Path, clean: None, monkeypatch: pytest.MonkeyPatch) -> Iterator
 
 @pytest.mark.usefixtures("sickly")
 def test_faults_of_a_package_s_method_are_its_own_and_leave_the_rest(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """One line that names method and package, and exit 2; what else was asked for is there."""
     job, run = tmp_path / "job.toml", tmp_path / "run"
@@ -274,7 +281,12 @@ def test_faults_of_a_package_s_method_are_its_own_and_leave_the_rest(
         last = capsys.readouterr().err.splitlines()[-1]
         assert re.fullmatch(rf'ddprt: method "{name}" of package sick-methods: {fault} mend or leave it out', last), last
     assert call("fit", job, "--out", run, "--methods.compare", '["raises"]') == 2
-    assert (run / "model.ddprt" / "model.json").is_file()
+    model = load_model(run / "model.ddprt")
+    sick = replace(model, method="raises", relighter=MeanMap(jnp.full((int(model.covered.sum()), 3), jnp.nan)))
+    with pytest.raises(
+        UserError, match='method "raises" of package sick-methods: got FloatingPointError: answers that are not'
+    ):
+        sick.predict(np.ones((model.points, 3)))
     words = ["--leagues.methods", '["raises", "not-a-number"]', "--leagues.trials", "1", "--leagues.seeds", "1"]
     assert call("bench", job, "--out", run, "--leagues", *words) == 0
     told = (run / "bench" / "leagues.md").read_text()

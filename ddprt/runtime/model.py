@@ -17,9 +17,9 @@ from ddprt.dataset.store import average_into_points
 from ddprt.errors import UserError
 from ddprt.fitting.encoding import Encoding
 from ddprt.lights import Light, Lighting, parse_lighting
+from ddprt.methods import packages
 from ddprt.methods.learned import TakesAnyPoints
 from ddprt.methods.method import AsksForLights, Frame, Relighter
-from ddprt.methods.packages import ORIGINS, blamed
 from ddprt.runtime.coefficients import Coefficients
 from ddprt.runtime.trust import Trust, Yardstick
 from ddprt.sampling.points import Samples
@@ -110,7 +110,7 @@ class Model:
         if not isinstance(clamp, bool | np.bool_ | str) or clamp not in (True, False, "energy"):
             raise UserError(f'clamp: got {clamp!r}, expected True, False or "energy"')
         area = self._shares if clamp == "energy" else None
-        with blamed(self.method):
+        with packages.blamed(self.method):
             told = self._described(lightings, len(frames), single) if isinstance(self.relighter, AsksForLights) else None
         if fade and told is not None:
             raise UserError(f"fade: got True for {self.method}, which answers from lights; leave it out, or fit svd-ridge")
@@ -119,9 +119,9 @@ class Model:
         if fade and chosen is not None:
             raise UserError("fade: got True with points, but trust is measured by all of them; leave one of the two out")
         places = self._places if chosen is None else (self._places[0][chosen], self._places[1][chosen])
-        with blamed(self.method):
+        with packages.blamed(self.method):
             light = np.asarray(_relight(self.relighter, self.encoding, frames, told, *places, bool(clamp), area))
-            if self.method in ORIGINS and not np.isfinite(light).all():
+            if self.method in packages.ORIGINS and not np.isfinite(light).all():
                 raise FloatingPointError("answers that are not finite")
         if fade and self.yardstick is not None:
             kept = self.yardstick.kept(self.yardstick.measure(self.encoding, frames).score)[:, None, None]
